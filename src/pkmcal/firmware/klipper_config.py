@@ -120,18 +120,15 @@ class KlipperConfig:
         names = self.entries.get("stepper_a", {}).keys()
         return "step_distance" in names or {"rotation_distance", "microsteps"} <= names
 
-    def step(self, section: str, turn: float | None = None) -> float:
-        """Travel of a stepper for one step, mm.
-
-        turn : travel for a revolution behind the gears, in place of rotation_distance.
-        """
+    def step(self, section: str) -> float:
+        """Travel of a stepper for one step, mm."""
         # the other steppers default to the first
         first, own = self.entries.get("stepper_a", {}), self.entries.get(section, {})
         stated = own if own.keys() & {"rotation_distance", "step_distance"} else first
         both = KlipperConfig(self.label, {section: {**first, **own}}, self.missing)
-        if turn is None and "step_distance" in stated and "rotation_distance" not in stated:
+        if "step_distance" in stated and "rotation_distance" not in stated:
             return both.positive(section, "step_distance")
-        turn = both.positive(section, "rotation_distance") if turn is None else turn
+        turn = both.positive(section, "rotation_distance")
         micro = both.positive(section, "microsteps")
         full = both.positive(section, "full_steps_per_rotation", FULL_STEPS)
         text, where = both.entries[section].get("gear_ratio", ("1:1", ""))
