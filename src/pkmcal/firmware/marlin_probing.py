@@ -4,7 +4,8 @@ Semantics: Marlin's gcode/bedlevel/abl/G29.cpp, gcode/calibrate/G33.cpp and M48.
 feature/bedlevel/abl/bbl.cpp and module/probe.h.
 
 - ``G29 V4`` and ``G30`` print ``Bed X: 50.00 Y: 0.00 Z: -0.01``: the place under the probe, and the
-  nozzle's height when the probe triggered plus the Z of M851. ``M48`` prints the standard deviation of the touches at one place.
+  nozzle's height when the probe triggered plus the Z of M851. ``M48`` prints the standard
+  deviation of the touches at one place.
 - ``M420 V`` prints the heights of a grid without its places: column k is at L + k (R - L) / (n - 1)
   of the ``G29 L R F B`` that probed it, row k likewise from F to B. Points that the probe does not
   reach are extrapolated from the others, without a mark. G29 refuses bounds whose four points on
