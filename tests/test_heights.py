@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +19,11 @@ from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
 from pkmcal.files import read_csv
-from pkmcal.firmware import klipper, reprap
+from pkmcal.firmware import reprap
 from pkmcal.firmware.contract import read_printer
 from pkmcal.firmware.klipper import Klipper
-from pkmcal.firmware.probed import read_touches
+from pkmcal.firmware.klipper_config import read_config
+from pkmcal.firmware.probed import read_measured
 from pkmcal.firmware.session import write_printer_session
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import load_mechanism
@@ -66,7 +68,7 @@ def flat(true, values, describe=SAYS):
 
 def pasted(text):
     """Settings of an exported text."""
-    config = klipper.sections(text, "x")
+    config = read_config(text, Path("x")).entries
     rows = [config[f"stepper_{s}"] for s in "abc"]
     names = ("angle", "arm_length", "position_endstop")
     each = [tuple(float(row[name][0]) for row in rows) for name in names]
@@ -359,8 +361,8 @@ def test_points_of_klippers_console(cfg):
     new = [f"// probe: at {x + 12:.3f},{y - 5.5:.3f} bed will contact at z={z:.6f}"
            for (x, y), z in zip(PLACES, Z, strict=True)]  # fmt: skip
     want = SAYS.carriages(np.column_stack([PLACES, Z]))
-    one = read_touches(text_file(folder, "Send: PROBE\n" + "\n".join(old)), printer)
-    other = read_touches(text_file(folder, "\n".join(new)), printer)
+    one = read_measured(text_file(folder, "Send: PROBE\n" + "\n".join(old)), printer)[0]
+    other = read_measured(text_file(folder, "\n".join(new)), printer)[0]
     np.testing.assert_allclose(one.carriages - 1.25, want, atol=1e-3)
     np.testing.assert_allclose(one.heights, 1.25)
     np.testing.assert_allclose(other.carriages, want, atol=1e-3)
@@ -447,7 +449,7 @@ def test_points_of_reprapfirmware(tmp_path):
     lines[-1] += " S-1"
     heights = " ".join(f"{z:.3f}" for z in Z)
     text = "\n".join([*lines, f"G32 bed probe heights: {heights}, mean 0.05, deviation 0.2"])
-    values = read_touches(text_file(tmp_path, text), printer)
+    values = read_measured(text_file(tmp_path, text), printer)[0]
     np.testing.assert_allclose(values.carriages, want, atol=2e-3)
 
 
@@ -460,7 +462,7 @@ def test_points_of_a_height_map(tmp_path):
         "X,Y,-40.00,40.00,-30.00,30.00,50.00,40.00,30.00,3,3\n"
         "      0,  0.010,      0\n  0.020,  0.000, -0.030\n  0.040,  0.050,      0\n"
     )
-    results = read_touches(text_file(tmp_path, text, "heightmap.csv"), printer)
+    results = read_measured(text_file(tmp_path, text, "heightmap.csv"), printer)[0]
     points = [(0, -30, 0.01), (-40, 0, 0.02), (0, 0, 0), (40, 0, -0.03), (-40, 30, 0.04),
               (0, 30, 0.05)]  # fmt: skip
     want = reprap_settings().carriages(np.array(points, dtype=float))
@@ -468,8 +470,24 @@ def test_points_of_a_height_map(tmp_path):
     old = text.replace("axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1",
                        "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum")  # fmt: skip
     old = old.replace("X,Y,-40", "-40")
-    same = read_touches(text_file(tmp_path, old, "heightmap.csv"), printer)
+    same = read_measured(text_file(tmp_path, old, "heightmap.csv"), printer)[0]
     np.testing.assert_allclose(same.carriages, want, atol=1e-9)
+    # of the first versions, with one spacing
+    first = old.replace("xspacing,yspacing", "spacing").replace("40.00,30.00,3,3", "40.00,3,3")
+    same = read_measured(text_file(tmp_path, first, "heightmap.csv"), printer)[0]
+    points = [(x, -30 + (y + 30) * 40 / 30, z) for x, y, z in points]
+    want = reprap_settings().carriages(np.array(points))
+    np.testing.assert_allclose(same.carriages, want, atol=1e-9)
+
+
+def test_a_printer_without_a_print_radius(tmp_path):
+    """M665 without B leaves the print radius as it was; exports write none."""
+    with_radius = read_printer(text_file(tmp_path, REPRAP, "config.g"))
+    text = re.sub(r" B[0-9.]+", "", REPRAP, count=1)
+    printer = read_printer(text_file(tmp_path, text, "config.g"))
+    assert with_radius.reach is not None
+    assert printer.reach is None
+    np.testing.assert_array_equal(printer.homed, with_radius.homed)
 
 
 def test_a_table_of_points(cfg):
@@ -625,6 +643,7 @@ MAP = "RepRapFirmware height map file v2\nxmin,xmax,ymin,ymax,radius,xspacing,ys
 WRONG_POINTS = {
     "ok\n": "there is no point of a bed in this file",
     "probe at 300.000,0.000 is z=0.1\n": "the printer does not reach this point",
+    MAP.replace("xmin,xmax", "axis0,axis1,min0,max0") + "X,Z,-1,1\n0.1\n": "not of the axes",
     MAP + "-10,10\n0.1\n": "the height map does not define its grid",
     MAP + "-10,10,-10,10,-1,0,10,3,3\n0.1,0.2,0.2\n": "a number above zero under xspacing",
     MAP + "-10,10,nan,10,-1,10,10,3,3\n0.1,0.2,0.2\n": "a number under ymin",
@@ -679,6 +698,6 @@ def test_of_a_value_above_and_in_saved_lines_klipper_takes_the_one_above():
     """As its own reader does; who pastes above and leaves SAVE_CONFIG's lines has the new value."""
     text = printers.calibrated_cfg()
     changed = text.replace("[stepper_a]\n", "[stepper_a]\nposition_endstop: 299.5\n", 1)
-    before, after = (Klipper().printer(t, "printer.cfg") for t in (text, changed))
+    before, after = (Klipper().printer(t, Path("printer.cfg")) for t in (text, changed))
     assert before.homed[0] - after.homed[0] == pytest.approx(0.5)
     np.testing.assert_array_equal(before.homed[1:], after.homed[1:])

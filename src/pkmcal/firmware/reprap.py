@@ -17,6 +17,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import ClassVar, final
 
 import numpy as np
@@ -44,7 +45,9 @@ from pkmcal.firmware.contract import (
     NUMBER,
     Firmware,
     Printer,
+    Touches,
     WrittenValues,
+    touches_at,
 )
 from pkmcal.wording import listed
 
@@ -62,6 +65,7 @@ _OWN_COMMAND = re.compile(
 )
 """Commands, or their words, that Marlin has not: M666 A and B are the bed's tilt."""
 _M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
+_PRINT_RADIUS = re.compile(r"^[^\S\n]*M665\b[^;\n]*\sB", re.MULTILINE)
 _OURS = re.compile(r"\s*M66[56]\b")
 HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
 _G30 = re.compile(r"^[^\S\n]*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
@@ -96,18 +100,21 @@ class RepRap(Firmware):
                 break
         return tuple(reasons)
 
-    def printer(self, text: str, label: str) -> Printer:
+    def printer(self, text: str, path: Path) -> Printer:
         """Printer of a file with M665 and M666; of repeated values the last counts.
 
         Raises InputError for missing, malformed or impossible values.
         """
+        label = path.name
         words, places = _checked_words(text, label)
-        rod, radius, height, reach = (
+        rod, radius, height = (
             _words(words, label, "665" + letter, size)
-            for letter, size in (("L", 3), ("R", 1), ("H", 1), ("B", 1))
+            for letter, size in (("L", 3), ("R", 1), ("H", 1))
         )
+        # without B the print radius is what was set before
+        reach = _words(words, label, "665B", 1) if _PRINT_RADIUS.search(text) else None
         for name, values in (("665L", rod), ("665R", radius), ("665H", height), ("665B", reach)):
-            if values.min() <= 0:
+            if values is not None and values.min() <= 0:
                 raise InputError(
                     f"M665 {name[-1]} is no number that a printer can have",
                     where=places[name],
@@ -131,19 +138,20 @@ class RepRap(Firmware):
             angle=np.array(REPRAP_TOWER_ANGLES) + corrections,
             rod=rod,
             homed=ends,
-            reach=float(reach[0]),
+            reach=None if reach is None else float(reach[0]),
             carriages=partial(reprap_carriage_heights, command),
             step=CARRIAGE_STEP if steps is None else float(1 / steps.min()),
             steps=steps,
         )
 
-    def touched(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
+    def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
         """Points of a height map, or of lines G30 with the heights that they printed."""
-        del printer
+        label = path.name
         if text.startswith(HEIGHT_MAP_TITLE):
-            return _height_map_points(text, label), 0.0
+            return touches_at(_height_map_points(text, label), 0.0, printer, label)
         if values := _HEIGHTS.findall(text):
-            return _sequence_points(text, label, values[-1][0]), 0.0
+            points = _sequence_points(text, label, values[-1][0])
+            return touches_at(points, 0.0, printer, label)
         return None
 
     def text(self, fit: Fit, source: MachineSource) -> str:
@@ -311,7 +319,7 @@ def _words(words: dict[str, Array], label: str, name: str, size: int) -> Array:
             where=label,
             found=f"{len(values)} numbers",
             expected="one, or one for each tower" if size > 1 else "one",
-            next_step="Name the file in which M665 has L, R, H and B: after M500 that is"
+            next_step="Name the file in which M665 has L, R and H: after M500 that is"
             " config-override.g",
         )
     return np.broadcast_to(values, (size,)).copy()
@@ -340,7 +348,15 @@ def _height_map_points(text: str, label: str) -> Array:
             )
         return value
 
-    # names of newer and older versions of RepRapFirmware
+    axes = [numbers.get(name, letter) for name, letter in (("axis0", "X"), ("axis1", "Y"))]
+    if axes != ["X", "Y"]:
+        raise InputError(
+            "the height map is not of the axes X and Y",
+            where=f"{label}, line 3",
+            found=", ".join(axes),
+            expected="X,Y",
+        )
+    # names since 3.3, since 1.19 and before, of RepRapFirmware
     x0, y0 = number_under("xmin", "min0"), number_under("ymin", "min1")
     dx = number_under("xspacing", "spacing0", "spacing", above=0.0)
     dy = number_under("yspacing", "spacing1", "spacing", above=0.0)

@@ -9,8 +9,8 @@ import numpy as np
 
 from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
-from pkmcal.firmware.contract import CARRIAGE_STEP, Printer, Touches, read_printer
-from pkmcal.firmware.probed import FEWEST_BED_POINTS, read_touches
+from pkmcal.firmware.contract import CARRIAGE_STEP, PartDistances, Printer, Touches, read_printer
+from pkmcal.firmware.probed import FEWEST_BED_POINTS, read_measured
 from pkmcal.mechanisms import MechanismDocument, checked_machine
 from pkmcal.starter import (
     STARTER_SQUARE_CHOICES,
@@ -96,17 +96,27 @@ stations:
   probe:
     tracker:
       poses: poses.csv        # the tool's height above the bed
-      # Standard deviation of the probe: Klipper's PROBE_ACCURACY and Marlin's M48 print it. A bed
+      # Standard deviation of the probe: {sigma_origin}. A bed
       # that is not flat to that counts as well, and is reported.
-      noise: {{position: 0.02 mm}}
+      noise: {{position: {sigma} mm}}
       level: true             # the firmware's Z is counted from the bed
 
+"""
+NO_DISTANCES_TEXT = """\
 # Heights do not determine how large a part comes out. Distances between marks of the tool do: the
 # carriages at each mark as further rows of joints.csv, and a table from,to,distance [mm].
 # distances:
 #   file: distances.csv
 #   noise: 0.03 mm            # how well they repeat
 """
+DISTANCES_TEXT = """\
+# Distances on a printed part; where they come from: {origin}.
+distances:
+  file: distances.csv
+  noise: 0.03 mm              # how well they repeat: calipers on a printed part, some 0.03 mm
+"""
+DEFAULT_PROBE_SIGMA = 0.02
+"""Standard deviation of a probe, mm, of files that do not state it."""
 
 
 def write_printer_session(
@@ -140,8 +150,15 @@ def printer_session_texts(
     """Files of a printer's session by name; arguments as for `write_printer_session`."""
     delta = read_printer(printer, firmware)
     if in_view is None:
-        touches = delta.touches if probed is None else read_touches(probed, delta)
-        return heights_texts(delta, _checked_touches(delta, touches))
+        # of the printer's own file, points that do not depend on its values come first
+        touches, distances = delta.touches, delta.distances
+        if probed is not None:
+            points, part = read_measured(probed, delta)
+            touches, distances = points or touches, part or distances
+        elif touches is None:
+            touches, part = read_measured(printer, delta, own=True)
+            distances = part or distances
+        return heights_texts(delta, _checked_touches(delta, touches), distances)
     return carried_texts(delta, places)
 
 
@@ -192,7 +209,8 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
             "there is no probed point of the bed",
             where=printer.label,
             expected="a section [delta_calibrate] with height0 and height0_pos, which Klipper's"
-            " DELTA_CALIBRATE and SAVE_CONFIG write, or Marlin's lines 'Bed X: Y: Z:'",
+            " DELTA_CALIBRATE and SAVE_CONFIG write, a mesh that Klipper saved, or Marlin's lines"
+            " 'Bed X: Y: Z:'",
             next_step="Name the printer's console output of a probing with --probed FILE; or"
             " --board, for a session with a camera",
         )
@@ -223,27 +241,52 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
     return touches
 
 
-def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
-    """Files by name of a session of bed heights."""
+def heights_texts(
+    printer: Printer, touches: Touches, distances: PartDistances | None = None
+) -> dict[str, str]:
+    """Files by name of a session of bed heights, and of distances on a printed part."""
     names = [f"{k + 1:03d}" for k in range(len(touches.heights))]
     heads = [f"{motor} [mm]" for motor in printer.firmware.motors]
+    sigma = DEFAULT_PROBE_SIGMA if touches.sigma is None else touches.sigma
+    session = PROBED_SESSION_TEXT.format(
+        n=len(names),
+        origin=legible(touches.origin),
+        to=printer.firmware.name,
+        sigma=f"{sigma:.3g}",
+        sigma_origin="Klipper's PROBE_ACCURACY and Marlin's M48 print it"
+        if touches.sigma is None
+        else "as that file has it",
+        **_resolution(printer),
+    )
+    poses = csv_text(["z [mm]"], names, touches.heights[:, None])
+    mechanism = nominal_text(printer, touches, distances) + FIRMWARE_FIXED_TEXT
+    carriages = touches.carriages
+    texts = {"poses.csv": poses, "mechanism.yaml": mechanism}
+    if distances is None:
+        session += NO_DISTANCES_TEXT
+    else:
+        session += DISTANCES_TEXT.format(origin=legible(distances.origin))
+        pairs = [(f"m{k:02d}a", f"m{k:02d}b") for k in range(1, len(distances.values) + 1)]
+        rows = zip(pairs, distances.values, strict=True)
+        texts["distances.csv"] = "from,to,distance [mm]\n" + "".join(
+            f"{first},{second},{value:.6g}\n" for (first, second), value in rows
+        )
+        names += [name for pair in pairs for name in pair]
+        marks = np.stack([distances.first, distances.second], axis=1).reshape(-1, 3)
+        carriages = np.vstack([carriages, marks])
     return {
-        "session.yaml": PROBED_SESSION_TEXT.format(
-            n=len(names),
-            origin=legible(touches.origin),
-            to=printer.firmware.name,
-            **_resolution(printer),
-        ),
-        "mechanism.yaml": nominal_text(printer, touches) + FIRMWARE_FIXED_TEXT,
-        "joints.csv": csv_text(heads, names, touches.carriages.round(6)),
-        "poses.csv": csv_text(["z [mm]"], names, touches.heights[:, None]),
+        "session.yaml": session,
+        **texts,
+        "joints.csv": csv_text(heads, names, carriages.round(6)),
     }
 
 
-def nominal_text(printer: Printer, touches: Touches | None = None) -> str:
+def nominal_text(
+    printer: Printer, touches: Touches | None = None, distances: PartDistances | None = None
+) -> str:
     """Nominal model of the printer as a mechanism file, without its key ``fixed``.
 
-    touches : probed points that the ranges of the carriages have to include.
+    touches, distances : measurements that the ranges of the carriages have to include.
     """
     angle = np.deg2rad(printer.angle)
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -254,6 +297,7 @@ def nominal_text(printer: Printer, touches: Touches | None = None) -> str:
     with np.errstate(invalid="ignore"):
         carriages = [printer.carriages(s * edge) for s in (-1.0, 1.0)]
     carriages += [] if touches is None else [touches.carriages]
+    carriages += [] if distances is None else [distances.first, distances.second]
     lowest = float(np.nanmin(np.concatenate(carriages))) - CARRIAGE_MARGIN_BELOW
     # tool height at which the first carriage reaches its end switch, on the axis
     top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import ClassVar, final
 
 import numpy as np
@@ -64,7 +65,8 @@ CONFIG_WORDS = {
 }
 """Words of commands by keys of the file config."""
 _HEADING = re.compile(r";\s*(Optional arm solution specific settings|Max Z\s*$)", re.MULTILINE)
-_CONFIG_LINE = re.compile(r"([a-z][a-z0-9_.]*)\s+(\S+)")
+_CONFIG_LINE = re.compile(r"([a-z][a-z0-9_.]*)\s+([^\s=:]\S*)")
+"""Key and value; with = or : between, the line is of another program, such as Klipper."""
 
 
 @final
@@ -94,11 +96,12 @@ class Smoothie(Firmware):
                 break
         return tuple(reasons)
 
-    def printer(self, text: str, label: str) -> Printer:
+    def printer(self, text: str, path: Path) -> Printer:
         """Printer of commands, or of config; commands count more, as after config-override.
 
         Raises InputError for missing, malformed or impossible values.
         """
+        label = path.name
         words = {**_config_words(text, label), **read_commands(text, label, SMOOTHIE_COMMANDS)}
         return _settings(words, label).printer(self, label)
 
