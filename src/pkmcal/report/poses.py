@@ -43,7 +43,10 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
             _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off"),
             _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned"),
         ),
-        tables=(_mounts(session, estimate), _worst(session, poses, estimate, error)),
+        tables=(
+            _mounts(session, estimate),
+            *([] if session.heights_alone else [_worst(session, poses, estimate, error)]),
+        ),
     )
 
 
