@@ -7,10 +7,15 @@ from typing import Literal
 
 import numpy as np
 
+from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
 from pkmcal.firmware.contract import CARRIAGE_STEP, Printer, Touches, read_printer
+from pkmcal.firmware.part import PrintedPart, read_part
 from pkmcal.firmware.probed import FEWEST_BED_POINTS, read_touches
+from pkmcal.measurements.contract import MeasurementKind
+from pkmcal.measurements.distances import Distances
+from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import MechanismDocument, checked_machine
 from pkmcal.starter import (
     STARTER_SQUARE_CHOICES,
@@ -96,16 +101,25 @@ stations:
   probe:
     tracker:
       poses: poses.csv        # the tool's height above the bed
-      # Standard deviation of the probe: Klipper's PROBE_ACCURACY and Marlin's M48 print it. A bed
-      # that is not flat to that counts as well, and is reported.
-      noise: {{position: 0.02 mm}}
+      # Standard deviation of the probe: Klipper's PROBE_ACCURACY and Marlin's M48 print yours;
+      # {probe} is pkmcal's default. A bed that is not flat to that counts as well, and is reported.
+      # noise: {{position: {probe}}}
       level: true             # the firmware's Z is counted from the bed
 
-# Heights do not determine how large a part comes out. Distances between marks of the tool do: the
-# carriages at each mark as further rows of joints.csv, and a table from,to,distance [mm].
-# distances:
-#   file: distances.csv
-#   noise: 0.03 mm            # how well they repeat
+"""
+NO_PART_TEXT = """\
+# Heights do not determine how large a part comes out. Distances on a printed part do: write them
+# into a file, and make the session again with --part FILE.
+"""
+PART_TEXT = """\
+# Distances on a printed part, by {label}{shrinkage}.
+# Further rows of joints.csv are the carriages at its marks, by the firmware's values.
+distances:
+  file: distances.csv
+"""
+DEFAULT_CALIPER_TEXT = """\
+  # Standard deviation of a distance; {sigma} is pkmcal's default.
+  # noise: {sigma}
 """
 
 
@@ -116,6 +130,7 @@ def write_printer_session(
     in_view: Literal["board"] | None = None,
     places: int = 1,
     firmware: str | None = None,
+    part: Path | None = None,
 ) -> tuple[str, ...]:
     """Write a printer's session into a new or empty folder and return the names of its files.
 
@@ -124,10 +139,12 @@ def write_printer_session(
     in_view : ``board`` for a session with a board on the tool; None for a session of heights.
     places : number of stations of a session with a board.
     firmware : the firmware's name, for a file that does not show it.
+    part : file of a printed part, beside heights.
 
     Raises InputError for files that lack necessary values.
     """
-    return write_texts(folder, printer_session_texts(printer, probed, in_view, places, firmware))
+    texts = printer_session_texts(printer, probed, in_view, places, firmware, part)
+    return write_texts(folder, texts)
 
 
 def printer_session_texts(
@@ -136,12 +153,14 @@ def printer_session_texts(
     in_view: Literal["board"] | None = None,
     places: int = 1,
     firmware: str | None = None,
+    part: Path | None = None,
 ) -> dict[str, str]:
     """Files of a printer's session by name; arguments as for `write_printer_session`."""
     delta = read_printer(printer, firmware)
     if in_view is None:
         touches = delta.touches if probed is None else read_touches(probed, delta)
-        return heights_texts(delta, _checked_touches(delta, touches))
+        printed = None if part is None else read_part(part, delta)
+        return heights_texts(delta, _checked_touches(delta, touches), printed)
     return carried_texts(delta, places)
 
 
@@ -223,27 +242,59 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
     return touches
 
 
-def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
-    """Files by name of a session of bed heights."""
-    names = [f"{k + 1:03d}" for k in range(len(touches.heights))]
+def heights_texts(
+    printer: Printer, touches: Touches, part: PrintedPart | None = None
+) -> dict[str, str]:
+    """Files by name of a session of bed heights, and of distances on a printed part."""
+    heights = [f"{k + 1:03d}" for k in range(len(touches.heights))]
     heads = [f"{motor} [mm]" for motor in printer.firmware.motors]
+    names, carriages, distances = heights, touches.carriages, dict[str, str]()
+    if part is not None:
+        names, carriages = [*heights, *part.names], np.concatenate([carriages, part.carriages])
+        distances["distances.csv"] = _distances_text(part)
+    session = PROBED_SESSION_TEXT.format(
+        n=len(heights),
+        origin=legible(touches.origin),
+        to=printer.firmware.name,
+        probe=_default_sigma(Heights),
+        **_resolution(printer),
+    )
     return {
-        "session.yaml": PROBED_SESSION_TEXT.format(
-            n=len(names),
-            origin=legible(touches.origin),
-            to=printer.firmware.name,
-            **_resolution(printer),
-        ),
-        "mechanism.yaml": nominal_text(printer, touches) + FIRMWARE_FIXED_TEXT,
-        "joints.csv": csv_text(heads, names, touches.carriages.round(6)),
-        "poses.csv": csv_text(["z [mm]"], names, touches.heights[:, None]),
+        "session.yaml": session + (NO_PART_TEXT if part is None else _part_text(part)),
+        "mechanism.yaml": nominal_text(printer, carriages) + FIRMWARE_FIXED_TEXT,
+        "joints.csv": csv_text(heads, names, carriages.round(6)),
+        "poses.csv": csv_text(["z [mm]"], heights, touches.heights[:, None]),
+        **distances,
     }
 
 
-def nominal_text(printer: Printer, touches: Touches | None = None) -> str:
+def _part_text(part: PrintedPart) -> str:
+    """Entry ``distances`` of session.yaml."""
+    shrinkage = (
+        f", whose shrinkage of {100 * part.shrinkage:g} % is undone" if part.shrinkage else ""
+    )
+    text = PART_TEXT.format(label=legible(part.label), shrinkage=shrinkage)
+    if part.noise is None:
+        return text + DEFAULT_CALIPER_TEXT.format(sigma=_default_sigma(Distances))
+    return text + f"  noise: {part.noise:g} mm\n"
+
+
+def _distances_text(part: PrintedPart) -> str:
+    """Table of the distances."""
+    rows = zip(part.between.tolist(), part.distance.round(6).tolist(), strict=True)
+    lines = [f"{part.names[a]},{part.names[b]},{value!r}" for (a, b), value in rows]
+    return "\n".join(["from,to,distance [mm]", *lines]) + "\n"
+
+
+def _default_sigma(kind: type[MeasurementKind]) -> str:
+    """Default standard deviation of a kind, mm, in words."""
+    return f"{1e3 * (kind.default_sigma or 0.0):g} mm"
+
+
+def nominal_text(printer: Printer, reached: Array | None = None) -> str:
     """Nominal model of the printer as a mechanism file, without its key ``fixed``.
 
-    touches : probed points that the ranges of the carriages have to include.
+    reached : (n, 3) mm, heights of the carriages that their ranges have to include.
     """
     angle = np.deg2rad(printer.angle)
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -253,7 +304,7 @@ def nominal_text(printer: Printer, touches: Touches | None = None) -> str:
     # lowest carriages at the bed's edge, towards the towers and away from them, and at the touches
     with np.errstate(invalid="ignore"):
         carriages = [printer.carriages(s * edge) for s in (-1.0, 1.0)]
-    carriages += [] if touches is None else [touches.carriages]
+    carriages += [] if reached is None else [reached]
     lowest = float(np.nanmin(np.concatenate(carriages))) - CARRIAGE_MARGIN_BELOW
     # tool height at which the first carriage reaches its end switch, on the axis
     top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())

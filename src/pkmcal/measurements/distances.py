@@ -85,7 +85,7 @@ class Distances(LinkKind):
     one: ClassVar = "distance"
     label: ClassVar = "distances"
     unit: ClassVar = "m"
-    default_sigma: ClassVar = 3e-5
+    default_sigma: ClassVar[float] = 3e-5
     own_sigma: ClassVar = "measuring some of them twice shows yours"
     key: ClassVar = "distances"
     schema: ClassVar = DistancesDocument
