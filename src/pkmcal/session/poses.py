@@ -129,6 +129,14 @@ def read_poses(
     table = read_csv(path, label=label)
     kind = _kind(table)
     table.check_kinds([kind.units.get(name, "") for name in table.columns])
+    if level and not kind.levels:
+        raise InputError(
+            "level applies to heights only",
+            where=label,
+            found=f"columns {', '.join(table.columns)}",
+            expected="configuration and z",
+            next_step="Leave level out: the orientation of such a tracker is estimated",
+        )
     by_default = position is None and kind.default_sigma is not None
     position = kind.default_sigma if by_default else position
     for measured, sigma, what, unit, stated in (
@@ -152,14 +160,6 @@ def read_poses(
             expected=f"{kind.fewest_rows} at least",
         )
     T = kind.T_tracker_target(table)
-    if level and not kind.levels:
-        raise InputError(
-            "level applies to heights only",
-            where=label,
-            found=f"columns {', '.join(table.columns)}",
-            expected="configuration and z",
-            next_step="Leave level out: the orientation of such a tracker is estimated",
-        )
     return PoseTable(name, label, kind.code, rows, T, position, rotation, level, by_default)
 
 
