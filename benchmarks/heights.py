@@ -32,7 +32,7 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.exporters.contract import make_export
-from pkmcal.firmware.klipper import sections
+from pkmcal.firmware.klipper_config import read_config
 from pkmcal.firmware.session import write_printer_session
 from pkmcal.mechanisms import Machine
 
@@ -166,7 +166,7 @@ def exported(calibration: Calibration) -> printers.Settings:
     bed = calibration.identification.bed
     source = MachineSource(calibration.machine, bed=bed.z if bed else None)
     (text,) = make_export(source, "klipper").files.values()
-    values = sections(text, "printer.cfg")
+    values = read_config(text, Path("printer.cfg")).entries
     each = {
         name: tuple(float(values[f"stepper_{s}"][name][0]) for s in "abc")
         for name in ("angle", "arm_length", "position_endstop")

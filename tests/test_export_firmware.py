@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 from configparser import ConfigParser
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,7 +101,7 @@ def test_a_firmware_reads_what_it_writes(firmware):
     machine = with_values(ideal_linear(), **entries)
     (text,) = firmware.files(source_of(machine)).values()
     assert [one for one in firmwares() if one.evidence(text, "x")] == [firmware]
-    printer = firmware_of(text, "x").printer(text, "x")
+    printer = firmware_of(text, "x").printer(text, Path("x"))
     assert printer.radius == pytest.approx(110, abs=1e-3)
     assert printer.reach == (None if firmware.name in ("marlin", "smoothie") else 90.5)
     np.testing.assert_allclose(np.sort(printer.rod), [269.5, 270, 271.2], atol=1e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,10 +20,11 @@ from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
 from pkmcal.files import read_csv
-from pkmcal.firmware import klipper, reprap
+from pkmcal.firmware import reprap
 from pkmcal.firmware.contract import read_printer
 from pkmcal.firmware.klipper import Klipper
-from pkmcal.firmware.probed import read_touches
+from pkmcal.firmware.klipper_config import read_config
+from pkmcal.firmware.probed import read_measured
 from pkmcal.firmware.session import write_printer_session
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import load_mechanism
@@ -67,7 +69,7 @@ def flat(true, values, describe=SAYS):
 
 def pasted(text):
     """Settings of an exported text."""
-    config = klipper.sections(text, "x")
+    config = read_config(text, Path("x")).entries
     rows = [config[f"stepper_{s}"] for s in "abc"]
     names = ("angle", "arm_length", "position_endstop")
     each = [tuple(float(row[name][0]) for row in rows) for name in names]
@@ -405,8 +407,8 @@ def test_points_of_klippers_console(cfg):
     new = [f"// probe: at {x + 12:.3f},{y - 5.5:.3f} bed will contact at z={z:.6f}"
            for (x, y), z in zip(PLACES, Z, strict=True)]  # fmt: skip
     want = SAYS.carriages(np.column_stack([PLACES, Z]))
-    one = read_touches(text_file(folder, "Send: PROBE\n" + "\n".join(old)), printer)
-    other = read_touches(text_file(folder, "\n".join(new)), printer)
+    one = read_measured(text_file(folder, "Send: PROBE\n" + "\n".join(old)), printer)[0]
+    other = read_measured(text_file(folder, "\n".join(new)), printer)[0]
     np.testing.assert_allclose(one.carriages - 1.25, want, atol=1e-3)
     np.testing.assert_allclose(one.heights, 1.25)
     np.testing.assert_allclose(other.carriages, want, atol=1e-3)
@@ -493,7 +495,7 @@ def test_points_of_reprapfirmware(tmp_path):
     lines[-1] += " S-1"
     heights = " ".join(f"{z:.3f}" for z in Z)
     text = "\n".join([*lines, f"G32 bed probe heights: {heights}, mean 0.05, deviation 0.2"])
-    values = read_touches(text_file(tmp_path, text), printer)
+    values = read_measured(text_file(tmp_path, text), printer)[0]
     np.testing.assert_allclose(values.carriages, want, atol=2e-3)
 
 
@@ -506,7 +508,7 @@ def test_points_of_a_height_map(tmp_path):
         "X,Y,-40.00,40.00,-30.00,30.00,50.00,40.00,30.00,3,3\n"
         "      0,  0.010,      0\n  0.020,  0.000, -0.030\n  0.040,  0.050,      0\n"
     )
-    results = read_touches(text_file(tmp_path, text, "heightmap.csv"), printer)
+    results = read_measured(text_file(tmp_path, text, "heightmap.csv"), printer)[0]
     points = [(0, -30, 0.01), (-40, 0, 0.02), (0, 0, 0), (40, 0, -0.03), (-40, 30, 0.04),
               (0, 30, 0.05)]  # fmt: skip
     want = reprap_settings().carriages(np.array(points, dtype=float))
@@ -514,7 +516,7 @@ def test_points_of_a_height_map(tmp_path):
     old = text.replace("axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1",
                        "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum")  # fmt: skip
     old = old.replace("X,Y,-40", "-40")
-    same = read_touches(text_file(tmp_path, old, "heightmap.csv"), printer)
+    same = read_measured(text_file(tmp_path, old, "heightmap.csv"), printer)[0]
     np.testing.assert_allclose(same.carriages, want, atol=1e-9)
 
 
@@ -720,6 +722,6 @@ def test_of_a_value_above_and_in_saved_lines_klipper_takes_the_one_above():
     """As its own reader does; who pastes above and leaves SAVE_CONFIG's lines has the new value."""
     text = printers.calibrated_cfg()
     changed = text.replace("[stepper_a]\n", "[stepper_a]\nposition_endstop: 299.5\n", 1)
-    before, after = (Klipper().printer(t, "printer.cfg") for t in (text, changed))
+    before, after = (Klipper().printer(t, Path("printer.cfg")) for t in (text, changed))
     assert before.homed[0] - after.homed[0] == pytest.approx(0.5)
     np.testing.assert_array_equal(before.homed[1:], after.homed[1:])

@@ -18,7 +18,7 @@ from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
 from pkmcal.exporters.delta import read_firmware_from_base
 from pkmcal.firmware.contract import read_printer
-from pkmcal.firmware.probed import read_touches
+from pkmcal.firmware.probed import read_measured
 from pkmcal.firmware.session import heights_texts, nominal_text, write_printer_session
 from pkmcal.geometry.rigid import apply
 from pkmcal.mechanisms import load_mechanism
@@ -270,7 +270,7 @@ def bed_lines(points):
 def test_points_are_those_under_the_probe(tmp_path):
     printer = read_printer(text_file(tmp_path, M503))
     points = np.array([[10.0, -20.0, 0.1], [40.0, 10.0, -0.2], [40.0, 10.0, -0.4]])
-    touches = read_touches(text_file(tmp_path, bed_lines(points), "log.txt"), printer)
+    touches = read_measured(text_file(tmp_path, bed_lines(points), "log.txt"), printer)[0]
     tool = np.array([[0.0, 0.0, 16.1], [30.0, 30.0, 15.7]])
     np.testing.assert_allclose(touches.carriages, printer.carriages(tool))
     np.testing.assert_allclose(touches.heights, [16.0, 16.0])
@@ -318,14 +318,15 @@ def test_a_log_of_settings_and_points_is_a_session(tmp_path):
 def test_heights_without_places_are_refused_with_what_to_do(text, tmp_path):
     printer = read_printer(text_file(tmp_path, M503))
     with pytest.raises(InputError) as caught:
-        read_touches(text_file(tmp_path, text, "log.txt"), printer)
+        read_measured(text_file(tmp_path, text, "log.txt"), printer)[0]
     assert "G29 V4" in caught.value.next_step
 
 
 def test_points_of_a_probe_somewhere_are_refused(tmp_path):
     """M851 of older versions has no X and Y."""
+    path = text_file(tmp_path, OLDER + bed_lines(np.zeros((7, 3))))
     with pytest.raises(InputError) as caught:
-        read_printer(text_file(tmp_path, OLDER + bed_lines(np.zeros((7, 3)))))
+        read_measured(path, read_printer(path), own=True)
     assert "M851 X Y Z" in caught.value.expected
 
 
@@ -488,7 +489,7 @@ def test_steps_of_reprapfirmware_are_corrected(tmp_path):
 def test_a_session_of_heights_has_what_exports_keep(tmp_path):
     printer = read_printer(text_file(tmp_path, M503))
     points = [[x + 10, y - 20, 0.0] for x, y in printers.bed(7, 60.0)]
-    touches = read_touches(text_file(tmp_path, bed_lines(points), "log.txt"), printer)
+    touches = read_measured(text_file(tmp_path, bed_lines(points), "log.txt"), printer)[0]
     texts = heights_texts(printer, touches)
     assert "height_offset: -16 mm" in texts["mechanism.yaml"]
     assert "steps_per_mm: [80, 80, 100]" in texts["mechanism.yaml"]

@@ -65,10 +65,28 @@ class Touches:
     carriages : (n, 3) mm, positions of the carriages at contact.
     heights : (n,) mm, height of the tool's tip above the bed at these positions.
     origin : the file they were read from, for messages.
+    sigma : standard deviation of the probe, mm, by the same file; None where unknown.
     """
 
     carriages: Array
     heights: Array
+    origin: str
+    sigma: float | None = None
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True)
+class PartDistances:
+    """Distances between marks that the tool left on a printed part.
+
+    first, second : (n, 3) mm, positions of the carriages at the two marks.
+    values : (n,) mm. origin : the file they were read from, for messages.
+    """
+
+    first: Array
+    second: Array
+    values: Array
     origin: str
 
     __repr__ = short_repr
@@ -86,7 +104,8 @@ class Printer:
     reach : print radius, None if unknown.
     carriages : map from tool points (n, 3) to carriage heights (n, 3), by the firmware's formulas.
     offset : (x, y, z) of the probe from the nozzle.
-    touches : probed points in the same file, None for none.
+    touches : probed points in the same file that do not depend on its values, None for none.
+    distances : distances on a printed part, likewise.
     step : carriage travel per motor step.
     steps : (3,) motor steps per mm of carriage travel, None if unknown.
     height_offset : what the firmware's height at home contains beyond the nozzle's, None for a
@@ -104,6 +123,7 @@ class Printer:
     carriages: Callable[[Array], Array]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     touches: Touches | None = None
+    distances: PartDistances | None = None
     step: float = CARRIAGE_STEP
     steps: Array | None = None
     height_offset: float | None = None
@@ -167,19 +187,23 @@ class Firmware(Exporter, ABC):
         """
 
     @abstractmethod
-    def printer(self, text: str, label: str) -> Printer:
-        """Printer of a configuration; label : name of its file.
+    def printer(self, text: str, path: Path) -> Printer:
+        """Printer of a configuration; path : its file, beside which included files are.
 
         Raises InputError for missing, malformed or impossible values.
         """
 
-    def touched(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
+    def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
         """Probed points of the bed in a console's output or a file of the firmware.
 
-        Tool positions (n, 3) mm at contact, and the height of the tool's tip above the bed there;
         None for a text without any, and for a firmware whose points are not read. Raises InputError
         for points that cannot be read.
         """
+        del text, path, printer
+        return None
+
+    def distances(self, text: str, label: str, printer: Printer) -> PartDistances | None:
+        """Distances on a printed part in a console's output; None for a text without any."""
         del text, label, printer
         return None
 
@@ -315,7 +339,7 @@ def read_printer(path: Path, firmware: str | None = None) -> Printer:
     """
     label = path.name
     text = read_text(path, largest=LARGEST_WRITTEN_FILE)
-    return buildable_delta(firmware_of(text, label, firmware).printer(text, label))
+    return buildable_delta(firmware_of(text, label, firmware).printer(text, path))
 
 
 def firmware_of(text: str, label: str, name: str | None = None) -> Firmware:
@@ -361,14 +385,25 @@ def firmware_of(text: str, label: str, name: str | None = None) -> Firmware:
         where=label,
         found=quoted(first),
         expected=", or ".join(one.configuration for one in by_name.values()),
-        next_step="Name the file that holds these values (files that it includes are not followed),"
-        f" or its firmware with --firmware ({listed(list(by_name))}): the meaning of M665 and M666"
-        " depends on it",
+        next_step="Name the file that holds these values, or its firmware with --firmware"
+        f" ({listed(list(by_name))}): the meaning of M665 and M666 depends on it",
     )
 
 
-def touches_at(points: Array, height: float, printer: Printer, label: str) -> Touches:
+def touches_at(
+    points: Array, height: float, printer: Printer, label: str, sigma: float | None = None
+) -> Touches:
     """Touches of the tool at points (n, 3) mm, at one height above the bed.
+
+    label : the file that they are from. sigma : of the probe, mm. Raises InputError for points that
+    the printer does not reach.
+    """
+    carriages = reachable_carriages(points, printer, label)
+    return Touches(carriages, np.full(len(points), height), label, sigma)
+
+
+def reachable_carriages(points: Array, printer: Printer, label: str) -> Array:
+    """Carriages (n, 3) mm with the tool at points (n, 3) mm.
 
     label : the file that they are from. Raises InputError for points that the printer does not
     reach.
@@ -384,10 +419,16 @@ def touches_at(points: Array, height: float, printer: Printer, label: str) -> To
             found=f"x {x:g}, y {y:g}, z {z:g} mm",
             expected="the tool's own places, in mm, of the printer described in " + printer.label,
         )
-    return Touches(carriages, np.full(len(points), height), label)
+    return carriages
 
 
 def means_by_position(points: Array) -> Array:
     """Mean points (m, 3) of the points (n, 3) with equal x and y, in the order of first contact."""
     places = list(dict.fromkeys(map(tuple, points[:, :2].tolist())))
     return np.array([points[(points[:, :2] == place).all(axis=1)].mean(axis=0) for place in places])
+
+
+def root_mean_square(texts: Sequence[str]) -> float | None:
+    """Root mean square of standard deviations that a console printed; None without any above 0."""
+    values = np.array(texts, dtype=float)
+    return float(np.sqrt(np.mean(values**2))) or None if len(values) else None

@@ -18,9 +18,6 @@ that H is right even where the version is not known.
 
 Versions of M665, by what M503 prints: L R S A B C (1.1.0, without the height); L R H S B X Y Z,
 B the calibration radius (up to 2.0.5); L R H S X Y Z A B C, rod trims (since 2.0.6).
-
-``G29 V4`` and ``G30`` print ``Bed X: 50.00 Y: 0.00 Z: -0.01``: the place under the probe, and the
-nozzle's height when the probe triggered plus the Z of M851.
 """
 
 from __future__ import annotations
@@ -28,7 +25,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar, final
 
 import numpy as np
@@ -48,15 +45,14 @@ from pkmcal.exporters.delta import (
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     CARRIAGE_STEP,
-    NUMBER,
     TOWER_ANGLES,
     Firmware,
     Printer,
+    Touches,
     WrittenValues,
-    means_by_position,
-    touches_at,
 )
 from pkmcal.firmware.definitions import Definitions
+from pkmcal.firmware.marlin_probing import marlin_touches
 from pkmcal.firmware.towers import (
     SettingNames,
     Settings,
@@ -96,12 +92,6 @@ _DELTA_HEADING = re.compile(r"echo:[\s;]*Delta settings|Delta settings: L[<=]", 
 _PROGRAM = re.compile(r"FIRMWARE_NAME:\s*Marlin|echo:\s*Marlin|For Marlin\.", re.IGNORECASE)
 _DELTA_DEFINE = re.compile(r"^[^\S\n]*#[^\S\n]*define[^\S\n]+(DELTA_\w+)", re.MULTILINE)
 _DELTA_CONDITION = re.compile(r"\s*#\s*if.*\bDELTA\b")
-_BED_POINT = re.compile(rf"\bBed X:\s*{NUMBER}\s+Y:\s*{NUMBER}\s+Z:\s*{NUMBER}")
-_PLACELESS = {
-    "Bilinear Leveling Grid:": "a grid of heights without its places",
-    "Bed Topography Report": "a map of heights without its places",
-    "G33 Auto Calibrate": "means of several points as G33 prints them, without their radius",
-}
 
 
 @final
@@ -146,12 +136,13 @@ class Marlin(Firmware):
                 break
         return tuple(reasons)
 
-    def printer(self, text: str, label: str) -> Printer:
+    def printer(self, text: str, path: Path) -> Printer:
         """Printer of what M503 printed, or of Configuration.h; of repeated values the last counts.
 
         Raises InputError for missing, malformed or impossible values, and for values whose meaning
         depends on what the file does not contain.
         """
+        label = path.name
         if inches := next(commands(text, ("G20",)), None):
             raise InputError(
                 "these values are in inches",
@@ -162,28 +153,11 @@ class Marlin(Firmware):
         words = read_commands(text, label, MARLIN_COMMANDS)
         by_command = any(name.startswith("665") for name in words)
         settings = _commanded(words, label) if by_command else _configured(text, label)
-        printer = settings.printer(self, label)
-        touched = self._bed_points(text, label, printer)
-        if touched is None:
-            return printer
-        return replace(printer, touches=touches_at(*touched, printer, label))
+        return settings.printer(self, label)
 
-    def touched(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
-        """Points of ``G29 V4`` and ``G30``; repeats at one place are averaged.
-
-        Raises InputError for maps that do not contain the places of their heights.
-        """
-        points = self._bed_points(text, label, printer)
-        heading = next((heading for heading in _PLACELESS if heading in text), None)
-        if points is not None or heading is None:
-            return points
-        raise InputError(
-            f"this is {_PLACELESS[heading]}",
-            where=label,
-            found=quoted(heading),
-            expected="lines such as 'Bed X: 50.00 Y: 0.00 Z: -0.01'",
-            next_step="Probe with G29 V4, or with G30 X Y at each place, and save what it prints",
-        )
+    def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
+        """Points of G29 V4, G30, G33 P3 V0, and of M420 V behind G29 L R F B."""
+        return marlin_touches(text, path.name, printer)
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header of comments, and the same values for Configuration.h below it."""
@@ -246,24 +220,6 @@ class Marlin(Firmware):
         ignored = settings.offset[np.abs(settings.offset) < LEAST_RETRACTION]
         retraction = Difference("offsets that Marlin ignores", largest(ignored), 0.0, "mm")
         return written_values(text, settings, others=(retraction,))
-
-    def _bed_points(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
-        """Tool positions (n, 3) mm at contact, and the tool's height above the bed there."""
-        values = [
-            match.groups() for line in text.splitlines() if (match := _BED_POINT.search(line))
-        ]
-        if not values:
-            return None
-        if not np.isfinite(printer.offset).all():
-            raise InputError(
-                "where the probe is beside the nozzle is not known",
-                where=printer.label,
-                expected="M851 X Y Z, as M503 prints it, or NOZZLE_TO_PROBE_OFFSET",
-                next_step=f"Add a line M851 with X, Y and Z; the points in {label} are those under"
-                " the probe",
-            )
-        points = np.array(values, dtype=float) - np.array(printer.offset)
-        return means_by_position(points), -printer.offset[2]
 
 
 # Reading commands

@@ -18,7 +18,7 @@ from pydantic import Field
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Keys, Schema, Share, closest, read_yaml, validated_document
-from pkmcal.firmware.contract import Printer, touches_at
+from pkmcal.firmware.contract import Printer, reachable_carriages
 from pkmcal.wording import listed
 
 MOST_MARKS, MOST_DISTANCES = 200, 1000
@@ -79,8 +79,8 @@ class PrintedPart:
     carriages: Array
     between: Integers
     distance: Array
-    noise: float | None
-    shrinkage: float
+    noise: float | None = None
+    shrinkage: float = 0.0
 
     __repr__ = short_repr
 
@@ -97,7 +97,7 @@ def read_part(path: Path, printer: Printer) -> PrintedPart:
     schema = validated_document(document, PartDocument)
     names = tuple(schema.marks)
     points = np.array(list(schema.marks.values()))
-    touches = touches_at(points, 0.0, printer, document.label)
+    carriages = reachable_carriages(points, printer, document.label)
     between = np.array(
         [_marks(document, k, entry, names) for k, entry in enumerate(schema.distances)]
     )
@@ -112,7 +112,7 @@ def read_part(path: Path, printer: Printer) -> PrintedPart:
     return PrintedPart(
         label=document.label,
         names=names,
-        carriages=touches.carriages,
+        carriages=carriages,
         between=between,
         distance=measured / shrunk,
         noise=schema.noise,

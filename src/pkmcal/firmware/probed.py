@@ -13,29 +13,33 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.exporters.delta import MM_A_METRE
 from pkmcal.files import read_csv, read_text
-from pkmcal.firmware.contract import Printer, Touches, firmwares, touches_at
+from pkmcal.firmware.contract import PartDistances, Printer, Touches, firmwares, touches_at
 
 FEWEST_BED_POINTS = 7
 """Fewest points that determine more than the bed's height and tilt; DELTA_CALIBRATE probes as many.
 """
 
 
-def read_touches(path: Path, printer: Printer) -> Touches:
-    """Read probed bed points; repeats of Klipper's probe at one place are averaged.
+def read_measured(
+    path: Path, printer: Printer, *, own: bool = False
+) -> tuple[Touches | None, PartDistances | None]:
+    """Read probed bed points, and distances on a printed part, of a file; None without any.
 
     The format follows from the contents of the file. The printer's values must be those in force
-    while it probed. Raises InputError for a file without points, and for points out of the
-    printer's reach.
+    while it probed and printed. own : whether the file is the printer's own configuration. Raises
+    InputError for another file without points or distances, and for points out of the printer's
+    reach.
     """
     label = path.name
     text = read_text(path)
-    # the tool's positions (n, 3) at contact with the tool's height above the bed there
     if text.startswith("configuration,"):
-        values = _table_points(path, label), 0.0
-    else:
-        each = (firmware.touched(text, label, printer) for firmware in firmwares())
-        values = next((points for points in each if points is not None), None)
-    if values is None:
+        return touches_at(_table_points(path, label), 0.0, printer, label), None
+    readers = [printer.firmware] if own else firmwares()
+    each = (firmware.touched(text, path, printer) for firmware in readers)
+    touches = next((one for one in each if one is not None), None)
+    each_part = (firmware.distances(text, label, printer) for firmware in readers)
+    distances = next((one for one in each_part if one is not None), None)
+    if touches is None and distances is None and not own:
         raise InputError(
             "there is no point of a bed in this file",
             where=label,
@@ -44,7 +48,7 @@ def read_touches(path: Path, printer: Printer) -> Touches:
             " G30 P0 X Y Z-99999, or a table"
             " configuration,x [mm],y [mm],z [mm]",
         )
-    return touches_at(*values, printer, label)
+    return touches, distances
 
 
 def _table_points(path: Path, label: str) -> Array:

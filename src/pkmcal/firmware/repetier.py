@@ -14,6 +14,7 @@ All motors have one number of steps per mm, and the firmware rounds towers and r
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import ClassVar, final
 
 import numpy as np
@@ -74,12 +75,12 @@ class Repetier(Firmware):
                     return (f"line {n} has the EEPROM's rod length, {ROD}",)
         return ()
 
-    def printer(self, text: str, label: str) -> Printer:
+    def printer(self, text: str, path: Path) -> Printer:
         """Printer of the EEPROM's values; of repeated ones the last counts.
 
         Raises InputError for missing, malformed or impossible values.
         """
-        return _settings(_eeprom(text, label), label).printer(self, label)
+        return _settings(_eeprom(text, path.name), path.name).printer(self, path.name)
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header. Raises InputError for a machine without motor steps."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import ClassVar, final
 
 import numpy as np
@@ -44,7 +45,9 @@ from pkmcal.firmware.contract import (
     NUMBER,
     Firmware,
     Printer,
+    Touches,
     WrittenValues,
+    touches_at,
 )
 from pkmcal.wording import listed
 
@@ -96,11 +99,12 @@ class RepRap(Firmware):
                 break
         return tuple(reasons)
 
-    def printer(self, text: str, label: str) -> Printer:
+    def printer(self, text: str, path: Path) -> Printer:
         """Printer of a file with M665 and M666; of repeated values the last counts.
 
         Raises InputError for missing, malformed or impossible values.
         """
+        label = path.name
         words, places = _checked_words(text, label)
         rod, radius, height, reach = (
             _words(words, label, "665" + letter, size)
@@ -137,13 +141,14 @@ class RepRap(Firmware):
             steps=steps,
         )
 
-    def touched(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
+    def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
         """Points of a height map, or of lines G30 with the heights that they printed."""
-        del printer
+        label = path.name
         if text.startswith(HEIGHT_MAP_TITLE):
-            return _height_map_points(text, label), 0.0
+            return touches_at(_height_map_points(text, label), 0.0, printer, label)
         if values := _HEIGHTS.findall(text):
-            return _sequence_points(text, label, values[-1][0]), 0.0
+            points = _sequence_points(text, label, values[-1][0])
+            return touches_at(points, 0.0, printer, label)
         return None
 
     def text(self, fit: Fit, source: MachineSource) -> str:

@@ -10,9 +10,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
-from pkmcal.firmware.contract import CARRIAGE_STEP, Printer, Touches, read_printer
+from pkmcal.firmware.contract import CARRIAGE_STEP, PartDistances, Printer, Touches, read_printer
 from pkmcal.firmware.part import PrintedPart, read_part
-from pkmcal.firmware.probed import FEWEST_BED_POINTS, read_touches
+from pkmcal.firmware.probed import FEWEST_BED_POINTS, read_measured
 from pkmcal.measurements.contract import MeasurementKind
 from pkmcal.measurements.distances import Distances
 from pkmcal.measurements.heights import Heights
@@ -101,11 +101,17 @@ stations:
   probe:
     tracker:
       poses: poses.csv        # the tool's height above the bed
-      # Standard deviation of the probe: Klipper's PROBE_ACCURACY and Marlin's M48 print yours;
-      # {probe} is pkmcal's default. A bed that is not flat to that counts as well, and is reported.
-      # noise: {{position: {probe}}}
+{probe_noise}      # A bed that is not flat to that counts as well, and is reported.
       level: true             # the firmware's Z is counted from the bed
 
+"""
+DEFAULT_PROBE_TEXT = """\
+      # Standard deviation of the probe: Klipper's PROBE_ACCURACY and Marlin's M48 print yours;
+      # {sigma} is pkmcal's default.
+      # noise: {{position: {sigma}}}
+"""
+PROBE_TEXT = """\
+      noise: {{position: {sigma}}}  # standard deviation of the probe, as that file has it
 """
 NO_PART_TEXT = """\
 # Heights do not determine how large a part comes out. Distances on a printed part do: write them
@@ -158,8 +164,16 @@ def printer_session_texts(
     """Files of a printer's session by name; arguments as for `write_printer_session`."""
     delta = read_printer(printer, firmware)
     if in_view is None:
-        touches = delta.touches if probed is None else read_touches(probed, delta)
-        printed = None if part is None else read_part(part, delta)
+        # points that do not depend on the printer's values come first in its own file
+        if probed is None:
+            touches, distances = read_measured(printer, delta, own=True)
+            touches = delta.touches or touches
+        else:
+            touches, distances = read_measured(probed, delta)
+            touches = touches or (delta.touches if distances else None)
+        printed = _of_pairs(distances or delta.distances)
+        if part is not None:
+            printed = read_part(part, delta)
         return heights_texts(delta, _checked_touches(delta, touches), printed)
     return carried_texts(delta, places)
 
@@ -256,7 +270,9 @@ def heights_texts(
         n=len(heights),
         origin=legible(touches.origin),
         to=printer.firmware.name,
-        probe=_default_sigma(Heights),
+        probe_noise=DEFAULT_PROBE_TEXT.format(sigma=_default_sigma(Heights))
+        if touches.sigma is None
+        else PROBE_TEXT.format(sigma=f"{touches.sigma:.3g} mm"),
         **_resolution(printer),
     )
     return {
@@ -266,6 +282,20 @@ def heights_texts(
         "poses.csv": csv_text(["z [mm]"], heights, touches.heights[:, None]),
         **distances,
     }
+
+
+def _of_pairs(distances: PartDistances | None) -> PrintedPart | None:
+    """The part of distances that have two marks of their own each."""
+    if distances is None:
+        return None
+    n = len(distances.values)
+    return PrintedPart(
+        label=distances.origin,
+        names=tuple(f"m{k:02d}{end}" for k in range(1, n + 1) for end in "ab"),
+        carriages=np.stack([distances.first, distances.second], axis=1).reshape(-1, 3),
+        between=np.arange(2 * n).reshape(n, 2),
+        distance=distances.values,
+    )
 
 
 def _part_text(part: PrintedPart) -> str:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import ClassVar, final
 
 import numpy as np
@@ -96,11 +97,12 @@ class Smoothie(Firmware):
                 break
         return tuple(reasons)
 
-    def printer(self, text: str, label: str) -> Printer:
+    def printer(self, text: str, path: Path) -> Printer:
         """Printer of commands, or of config; commands count more, as after config-override.
 
         Raises InputError for missing, malformed or impossible values.
         """
+        label = path.name
         words = {**_config_words(text, label), **read_commands(text, label, SMOOTHIE_COMMANDS)}
         return _settings(words, label).printer(self, label)
 
