@@ -73,7 +73,7 @@ def test_shrinkage_is_undone(printer, tmp_path):
         ("unit: mm", "unit: inch", "unit", "inch"),
         ("[a, b]", "[a, c]", "line 8, distances[2].between", "c"),
         ("[a, b]", "[a, a]", "line 8, distances[2].between", "a twice"),
-        ("apart: 98.7", "apart: 89.7", "distances[2]", "89.7 mm"),
+        ("apart: 98.7", "apart: 78.9", "distances[2]", "78.9 mm"),
         ("apart: 98.7", "apart: 98.7, inside: 80", "distances[2]", "apart and inside"),
         ("apart: 98.7", "inside: 98.7", "distances[2]", "inside"),
         (", apart: 98.7", "", "distances[2]", "no number"),

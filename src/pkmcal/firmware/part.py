@@ -22,7 +22,7 @@ from pkmcal.firmware.contract import Printer, reachable_carriages
 from pkmcal.wording import listed
 
 MOST_MARKS, MOST_DISTANCES = 200, 1000
-MOST_DEVIATION = 0.05
+MOST_DEVIATION = 0.1
 """Largest plausible difference of a distance from the drawing's, as a share of that."""
 MOST_SHRINKAGE = 0.05
 """Largest plausible shrinkage: common plastics shrink by less than 3 %."""

@@ -83,6 +83,9 @@ joints:
 FIRMWARE_FIXED_TEXT = """\
 # What the firmware can hold: towers upright, motors that move as far as it commands.
 fixed: ["legs[*].platform.center", "legs[*].base.axis", "legs[*].scale"]
+# pkmcal calibrate --model leaning estimates the towers' directions as well, two angles each.
+models:
+  leaning: {fixed: ["legs[*].platform.center", "legs[*].scale"]}
 """
 PLATFORM_FIXED_TEXT = """\
 fixed: ["legs[*].platform.center"]
