@@ -125,8 +125,8 @@ def test_every_height_before_and_after(kit, true):
     order = np.argsort(-np.abs(after / sigma))
     assert names == [heights[k]["configuration"] for k in order]
     assert [row["mark"] is not None for row in table["rows"]] == [True] + 18 * [False]
-    shown = run("calibrate", kit, "-o", kit.parent / "again").out
-    assert f"{names[0]} at x" in shown
+    text = run("calibrate", kit, "-o", kit.parent / "again").out
+    assert f"{names[0]} at x" in text
 
 
 def test_the_origin_of_the_noise_is_stated(kit, tmp_path):

@@ -131,9 +131,9 @@ def test_a_part_is_of_a_printer_beside_heights(tmp_path, beside):
 
 def prior_machine(rng):
     """A printer off its firmware's values by the prior sigmas of its session."""
-    says = printers.Settings()
-    a = np.deg2rad(says.angle)
-    towers = says.radius * np.column_stack([np.cos(a), np.sin(a), 0 * a])
+    nominal = printers.Settings()
+    a = np.deg2rad(nominal.angle)
+    towers = nominal.radius * np.column_stack([np.cos(a), np.sin(a), 0 * a])
     towers = 1e-3 * (towers + 2.0 * rng.normal(size=(3, 3)))
     rods = 1e-3 * (270 + 0.5 * rng.normal(size=3))
     legs = [

@@ -97,6 +97,7 @@ TASKS = (
     Task("read-camera FILE", ("cameras/*.*",), "", 10),
     Task("new OUT --printer FILE", PRINTERS, "", 4),
     Task("new OUT --printer printers/printer.cfg --probed FILE", POINTS, "", 4),
+    Task("new OUT --printer printers/printer.cfg --part FILE", ("printers/part.yaml",), "", 2),
     Task("look-at legs", LEGS, "", 2),
     Task("look-at board", BOARD, "", 1),
     Task("look-at hand", HAND, "", 1),

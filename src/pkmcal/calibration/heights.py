@@ -72,6 +72,11 @@ def probed_heights(
     """Heights of a session with their errors; empty without any."""
     poses, rows = measurements.poses, height_rows(measurements)
     configuration, station = poses.configuration[rows], poses.station[rows]
+    if not rows.size:
+        none = np.zeros(0)
+        return ProbedHeights(
+            configuration, station, none, none, none, none, none, none.astype(bool)
+        )
     state, machine, statistics = estimate.state, estimate.machine, estimate.statistics
     T_station_base = state.T_camera_base[station]
     joints = session.joints[configuration]

@@ -45,7 +45,6 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
 from pkmcal.session.load import Session
 
-LEAN = "machine.lean"
 MOST_TOOL_SHIFT = 1.0
 """Shift of the tool by a violation, in standard deviations, beyond which the result is refused."""
 
@@ -401,7 +400,9 @@ def _leaning_towers(
         own = np.any(directions[axis] != 0, axis=0)
         by = np.zeros((*measured.joints.shape, 2))
         by[used] = by_theta @ directions[:, own]
-        yield Column(LEAN, f"leg {leg + 1}", "lean", readings=by, facts=_of_lean, remark=True)
+        yield Column(
+            "machine.lean", f"leg {leg + 1}", "lean", readings=by, facts=_of_lean, remark=True
+        )
 
 
 def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
