@@ -86,7 +86,7 @@ def test_shrinkage_is_undone(printer, tmp_path):
         ),
         ("[60, 10.5, 5]", "[600, 10.5, 5]", "part.yaml", "x 600"),
         ("[60, 10.5, 5]", "[60, 10.5]", "marks.a", "3"),
-        ("  a: [", "  1a: [", "marks", "1a"),
+        ("  a: [", "  1a: [", "marks.1a", "a letter first"),
         ("marks:", "features:", "marks", "missing"),
         ("unit: mm", "unit: mm\nshrinkage: 20 %", "shrinkage", "20 %"),
         ("unit: mm", "unit: mm\nnoise: 0", "noise", "0"),

@@ -17,7 +17,16 @@ from pydantic import Field
 
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Keys, Schema, Share, closest, read_yaml, validated_document
+from pkmcal.files import (
+    Document,
+    Keys,
+    Schema,
+    Share,
+    closest,
+    quoted,
+    read_yaml,
+    validated_document,
+)
 from pkmcal.firmware.contract import Printer, reachable_carriages
 from pkmcal.wording import listed
 
@@ -27,8 +36,7 @@ MOST_DEVIATION = 0.1
 MOST_SHRINKAGE = 0.05
 """Largest plausible shrinkage: common plastics shrink by less than 3 %."""
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,39}$")]
-"""Name of a mark, which begins with a letter, as no height of a session does."""
+LONGEST_MARK = 40
 Millimetres = Annotated[float, Field(gt=0, lt=1e4)]
 
 
@@ -47,7 +55,7 @@ class PartDocument(Schema):
     """File of a printed part."""
 
     unit: Literal["mm"] = Field(description="unit: mm, of all positions and distances")
-    marks: dict[Name, tuple[float, float, float]] = Field(
+    marks: dict[str, tuple[float, float, float]] = Field(
         min_length=2,
         max_length=MOST_MARKS,
         description="the commanded positions [x, y, z] of two or more marks, in mm, by name",
@@ -96,6 +104,7 @@ def read_part(path: Path, printer: Printer) -> PrintedPart:
     document = read_yaml(path)
     schema = validated_document(document, PartDocument)
     names = tuple(schema.marks)
+    _check_names(document, names)
     points = np.array(list(schema.marks.values()))
     carriages = reachable_carriages(points, printer, document.label)
     between = np.array(
@@ -118,6 +127,21 @@ def read_part(path: Path, printer: Printer) -> PrintedPart:
         noise=schema.noise,
         shrinkage=schema.shrinkage,
     )
+
+
+def _check_names(document: Document, names: tuple[str, ...]) -> None:
+    """Raise InputError for a mark's name that could be that of a height, or that a table cannot
+    hold.
+    """
+    for name in names:
+        plain = name.isascii() and name.replace("_", "a").replace("-", "a").isalnum()
+        if not (plain and name[0].isalpha() and len(name) <= LONGEST_MARK):
+            raise InputError(
+                "this name of a mark cannot be used",
+                where=document.where("marks", name),
+                found=quoted(name),
+                expected=f"letters, digits, - and _, a letter first, {LONGEST_MARK} at most",
+            )
 
 
 def _marks(

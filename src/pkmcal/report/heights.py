@@ -83,7 +83,7 @@ def _table(session: Session, heights: ProbedHeights) -> Table:
             number(after / sigma, 1, signed=True),
             state,
         )
-        mark = {"rejected": Level.DOUBTFUL, "worst": Level.NOTE}.get(state)
+        mark = None if heights.used[k] else Level.DOUBTFUL
         rows.append(Row(name, cells, mark=mark, key=configuration_key(name)))
     return Table(
         "Every height before and after",

@@ -33,6 +33,7 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
     if not len(poses):
         return None
     error = errors(poses, estimate)
+    more_than_heights = bool(np.any(poses.whiten[..., :5] != 0))
     turns = (one.text for one in turning(session, poses, estimate.state.on_platform))
     return Part(
         "poses",
@@ -45,7 +46,7 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
         ),
         tables=(
             _mounts(session, estimate),
-            *([] if session.heights_alone else [_worst(session, poses, estimate, error)]),
+            *([_worst(session, poses, estimate, error)] if more_than_heights else []),
         ),
     )
 
