@@ -127,9 +127,10 @@ def test_a_printer_is_read_and_written_back(text, name, tmp_path):
     np.testing.assert_allclose(again.homed, want, atol=1e-3)
 
 
-def test_steps_of_smoothieware_are_corrected():
+@pytest.mark.parametrize("to", ["marlin", "reprap", "smoothie"])
+def test_steps_are_corrected_by_a_scale(to):
     machine, _ = perturbed(2, scale=(1.001, 1.0, 0.999))
-    (text,) = make_export(source_of(machine), "smoothie").files.values()
+    (text,) = make_export(source_of(machine), to).files.values()
     written = commands(text)
     np.testing.assert_allclose(
         [written["92" + c] for c in "XYZ"], STEPS / np.array([1.001, 1.0, 0.999]), atol=1e-4

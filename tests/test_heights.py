@@ -518,6 +518,22 @@ def test_points_of_a_height_map(tmp_path):
     old = old.replace("X,Y,-40", "-40")
     same = read_measured(text_file(tmp_path, old, "heightmap.csv"), printer)[0]
     np.testing.assert_allclose(same.carriages, want, atol=1e-9)
+    # of the first versions, with one spacing
+    first = old.replace("xspacing,yspacing", "spacing").replace("40.00,30.00,3,3", "40.00,3,3")
+    same = read_measured(text_file(tmp_path, first, "heightmap.csv"), printer)[0]
+    points = [(x, -30 + (y + 30) * 40 / 30, z) for x, y, z in points]
+    want = reprap_settings().carriages(np.array(points))
+    np.testing.assert_allclose(same.carriages, want, atol=1e-9)
+
+
+def test_a_printer_without_a_print_radius(tmp_path):
+    """M665 without B leaves the print radius as it was; exports write none."""
+    with_radius = read_printer(text_file(tmp_path, REPRAP, "config.g"))
+    text = re.sub(r" B[0-9.]+", "", REPRAP, count=1)
+    printer = read_printer(text_file(tmp_path, text, "config.g"))
+    assert with_radius.reach is not None
+    assert printer.reach is None
+    np.testing.assert_array_equal(printer.homed, with_radius.homed)
 
 
 def test_a_table_of_points(cfg):
@@ -668,6 +684,7 @@ MAP = "RepRapFirmware height map file v2\nxmin,xmax,ymin,ymax,radius,xspacing,ys
 WRONG_POINTS = {
     "ok\n": "there is no point of a bed in this file",
     "probe at 300.000,0.000 is z=0.1\n": "the printer does not reach this point",
+    MAP.replace("xmin,xmax", "axis0,axis1,min0,max0") + "X,Z,-1,1\n0.1\n": "not of the axes",
     MAP + "-10,10\n0.1\n": "the height map does not define its grid",
     MAP + "-10,10,-10,10,-1,0,10,3,3\n0.1,0.2,0.2\n": "a number above zero under xspacing",
     MAP + "-10,10,nan,10,-1,10,10,3,3\n0.1,0.2,0.2\n": "a number under ymin",

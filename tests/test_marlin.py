@@ -307,12 +307,96 @@ def test_a_log_of_settings_and_points_is_a_session(tmp_path):
     assert np.sqrt(np.mean(heights**2)) < 0.015
 
 
+def grid_lines(z, command):
+    """A grid (rows along y) as M420 V prints it behind a G29."""
+    lines = [f"Send: N7 {command}*42", "Recv: Bilinear Leveling Grid:"]
+    lines.append("Recv:  " + "".join(f"{k:7d}" for k in range(z.shape[1])))
+    lines += [f"Recv: {k:2d}" + "".join(f" {value:+.3f}" for value in row)
+              for k, row in enumerate(z)]  # fmt: skip
+    return "\n".join([*lines, "Recv: ", "Recv: ok"]) + "\n"
+
+
+def test_a_grid_has_the_places_of_its_command(tmp_path):
+    """Without the corners, which Marlin extrapolates where a probe 22 mm aside does not reach."""
+    x, y = np.linspace(-65, 65, 7), np.linspace(-60, 60, 6)
+    there = np.stack(np.meshgrid(x, y), axis=-1)
+    z = 0.2 + 1e-3 * there[..., 0] + 2e-3 * there[..., 1]
+    # print radius 90 mm, margin 10 mm
+    reached = np.linalg.norm(there, axis=-1) <= 80
+    reached &= np.linalg.norm(there - [10, -20], axis=-1) <= 90
+    assert not reached.all()
+    text = grid_lines(np.where(reached, z, 9.0), "G29 L-65 R65 F-60 B60")
+    printer = read_printer(text_file(tmp_path, M503))
+    log = text_file(tmp_path, "Send: G29 L-1 R1 F-1 B1\n" + text, "log.txt")
+    touches, _ = read_measured(log, printer)
+    true = printers.Settings(105.0, tuple(printer.angle), tuple(printer.rod))
+    tool = 1e3 * printers.machine(true).forward(1e-3 * touches.carriages)[:, :3, 3]
+    probe = tool + np.array([10, -20, 0])
+    np.testing.assert_allclose(probe[:, 2], 0.2 + probe[:, :2] @ [1e-3, 2e-3], atol=6e-4)
+    assert 20 <= len(probe) <= reached.sum()
+    assert np.linalg.norm(probe[:, :2], axis=1).max() > 60
+
+
+G33 = """\
+Send: G33 P3 V0
+Recv: G33 Auto Calibrate
+Recv: Checking... AC at radius:80.00 (DRY-RUN)
+Recv: .Height:284.00  Ex:-0.25  Ey:0.00  Ez:-1.50  Radius:105.00
+Recv: .              Tx:+0.20  Ty:-0.10  Tz:+0.30
+Recv: .      c:+0.10   x:-0.20   y:+0.30   z:-0.40
+Recv: .             yz:+0.50  zx:-0.60  xy:+0.70
+Recv: End DRY-RUN                                   std dev:0.437
+"""
+
+
+@pytest.mark.parametrize(("command", "offset"), [("G33 P3 V0", (0, 0)), ("G33 P3 V0 O", (10, -20))])
+def test_a_dry_run_of_g33_has_seven_places(command, offset, tmp_path):
+    """By its radius; with O the probe goes there, not the nozzle."""
+    printer = read_printer(text_file(tmp_path, M503))
+    log = text_file(tmp_path, G33.replace("G33 P3 V0", command), "log.txt")
+    touches, _ = read_measured(log, printer)
+    true = printers.Settings(105.0, tuple(printer.angle), tuple(printer.rod))
+    tool = 1e3 * printers.machine(true).forward(1e-3 * touches.carriages)[:, :3, 3]
+    turn = {"x": 210, "xy": 270, "y": 330, "yz": 30, "z": 90, "zx": 150}
+    heights = {"x": -0.2, "y": 0.3, "z": -0.4, "yz": 0.5, "zx": -0.6, "xy": 0.7}
+    want = [[0, 0, 0.1]]
+    want += [
+        [80 * np.cos(np.deg2rad(turn[k])), 80 * np.sin(np.deg2rad(turn[k])), z]
+        for k, z in heights.items()
+    ]
+    order = np.lexsort(np.round(want, 6).T)
+    mine = tool + np.array([*offset, 0])
+    np.testing.assert_allclose(
+        mine[np.lexsort(np.round(mine, 6).T)], np.array(want)[order], atol=1e-6
+    )
+
+
+def test_m48_is_the_noise(tmp_path):
+    printer = read_printer(text_file(tmp_path, M503))
+    text = "Recv: Finished!\nRecv: Mean: 0.01 Min: 0.0 Max: 0.1 Range: 0.1\n"
+    text += "Recv: Standard Deviation: 0.002500\n" + bed_lines(np.eye(3))
+    touches, _ = read_measured(text_file(tmp_path, text, "log.txt"), printer)
+    assert touches.sigma == 0.0025
+
+
+def without(text, word):
+    assert word in text
+    return text.replace(word, "")
+
+
 @pytest.mark.parametrize(
     "text",
     [
         "Bilinear Leveling Grid:\n      0      1\n 0 +0.010 +0.020\n",
+        grid_lines(np.zeros((3, 3)), "G29"),
+        grid_lines(np.zeros((3, 3)), "G29 L-60 R60 F-60"),
         "Bed Topography Report:\n",
         "G33 Auto Calibrate\nChecking... AC\n.    c:+0.10  x:+0.02  y:-0.01  z:+0.00\n",
+        without(G33, " at radius:80.00"),
+        without(G33, " (DRY-RUN)"),
+        without(G33, "P3 "),
+        without(G33, "z:-0.40"),
+        G33.replace("P3", "P4"),
     ],
 )
 def test_heights_without_places_are_refused_with_what_to_do(text, tmp_path):
@@ -354,10 +438,6 @@ CLAIMS = {
 def test_one_firmware_claims_a_file(name, tmp_path):
     text, firmware = CLAIMS[name]
     path = text_file(tmp_path, text)
-    if firmware == "reprap" and "B90" not in text:
-        with pytest.raises(InputError, match="M665 has no value B"):
-            read_printer(path)
-        return
     assert read_printer(path).firmware.name == firmware
     assert read_printer(path, firmware).firmware.name == firmware
 

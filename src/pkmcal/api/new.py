@@ -11,6 +11,7 @@ from typing import Any
 
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
+from pkmcal.firmware.klipper_machines import is_klipper, klipper_model
 from pkmcal.firmware.session import printer_session_texts
 from pkmcal.mechanisms import catalogue
 from pkmcal.outcome import Outcome, Verdict
@@ -154,9 +155,10 @@ def new(
         ``klipper``, ``marlin``, ``repetier``, ``reprap`` or ``smoothie``, for a ``printer`` that
         does not show which it is of.
     from_file :
-        File of a hexapod's joint centres: LinuxCNC's HAL file with pins of genhexkins, or a CSV
-        table with the columns leg, base_x, base_y, base_z, platform_x, platform_y, platform_z and
-        their units. With ``leg``, and where known ``travel`` and ``tube_radius``.
+        Klipper's printer.cfg of a rotary delta or a winch, or a file of a hexapod's joint centres:
+        LinuxCNC's HAL file with pins of genhexkins, or a CSV table with the columns leg, base_x,
+        base_y, base_z, platform_x, platform_y, platform_z and their units. Joint centres with
+        ``leg``, and where known ``travel`` and ``tube_radius``.
     unit :
         ``mm`` or ``inch``, of the lengths in a HAL file.
     base_radius, platform_radius :
@@ -255,7 +257,7 @@ def _nominal(
                 found="--machine besides",
                 expected="one of them",
             )
-        return centres_model(Path(from_file), unit, dimensions)
+        return _file_model(Path(from_file), unit, dimensions)
     if unit is not None:
         raise InputError(
             "a unit is named for a file of joint centres",
@@ -266,3 +268,18 @@ def _nominal(
     if dimensions or machine in FAMILIES.keys() - catalogue().keys():
         return family_model(machine, dimensions)
     return machine
+
+
+def _file_model(path: Path, unit: str | None, dimensions: Mapping[str, float]) -> NominalModel:
+    """Nominal model of Klipper's configuration, or of joint centres."""
+    if not is_klipper(path):
+        return centres_model(path, unit, dimensions)
+    if unit is not None or dimensions:
+        raise InputError(
+            "Klipper's configuration has all dimensions, in mm",
+            where="--from",
+            found=" and ".join([*map(option_of, dimensions), *(["--unit"] if unit else [])])
+            + " besides",
+            expected="neither --unit nor a dimension",
+        )
+    return klipper_model(path)

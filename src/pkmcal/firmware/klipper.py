@@ -58,6 +58,8 @@ from pkmcal.firmware.klipper_probing import (
 )
 from pkmcal.outcome.finding import Finding, note
 
+ROTARY_ANGLES = (30.0, 150.0, 270.0)
+"""Default directions of the arms of a rotary delta, degrees."""
 NO_KLIPPER_PRINT_RADIUS = (
     "There is no print_radius: keep the printer's own. Klipper takes delta_radius where none"
     " stands; then write the former delta_radius there."
@@ -76,7 +78,7 @@ class Klipper(Firmware):
     file: ClassVar = "pkmcal_printer.cfg"
     comment: ClassVar = "#"
     motors: ClassVar = ("stepper_a", "stepper_b", "stepper_c")
-    rotary: ClassVar = Freedoms((30.0, 150.0, 270.0), heights=False)
+    rotary: ClassVar = Freedoms(ROTARY_ANGLES, heights=False)
     carriage_source: ClassVar = "what Klipper's\nGET_POSITION prints behind stepper:"
 
     def evidence(self, text: str, label: str) -> tuple[str, ...]:

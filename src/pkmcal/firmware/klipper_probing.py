@@ -61,9 +61,9 @@ ANALYZED = {
 _TRIGGERED = re.compile(rf"probe at {NUMBER},{NUMBER} is z={NUMBER}")
 _CONTACT = re.compile(rf"probe: at {NUMBER},{NUMBER} bed will contact at z={NUMBER}")
 _RETRY = "Probe samples exceed tolerance. Retrying"
-_ACCURACY = re.compile(rf"probe accuracy results: .{{1,120}}standard deviation {NUMBER}")
+_ACCURACY = re.compile(rf"\bstandard deviation {NUMBER}")
 _ANALYZE = re.compile(r"\bDELTA_ANALYZE\s+([^\n;]*)")
-_ANALYZE_WORD = re.compile(r"\b([A-Z]{5,6}(?:_[A-Z]+){0,2})\s*=\s*[\[(]?\s*([-0-9.][-0-9., ]*)")
+_ANALYZE_WORD = re.compile(r"\b([A-Z]{5,6}(?:_[A-Z]+){0,2}) ?= ?[\[(]?([-0-9.][-0-9., ]*)")
 
 
 def saved_touches(config: KlipperConfig, ends: Array, mm_a_step: Array | None) -> Touches | None:
@@ -129,22 +129,28 @@ def probed_touches(text: str, label: str, printer: Printer) -> Touches | None:
 
     None without any. The standard deviation is that of PROBE_ACCURACY where the text has it.
     """
-    points: list[tuple[float, float, float]] = []
-    pattern = _TRIGGERED if _TRIGGERED.search(text) else _CONTACT
+    # the tool's positions, of older versions, and the points of the bed, of newer ones
+    triggered, contact = (list[tuple[float, float, float]]() for _ in range(2))
     for line in text.splitlines():
-        if match := pattern.search(line):
-            points.append((float(match[1]), float(match[2]), float(match[3])))
-        elif _RETRY in line and points:
-            place = points[-1][:2]
-            while points and points[-1][:2] == place:
-                points.pop()
-    if not points:
+        if match := _TRIGGERED.search(line):
+            triggered.append((float(match[1]), float(match[2]), float(match[3])))
+        elif match := _CONTACT.search(line):
+            contact.append((float(match[1]), float(match[2]), float(match[3])))
+        elif _RETRY in line:
+            _drop_last_place(triggered or contact)
+    if not triggered and not contact:
         return None
     dx, dy, dz = printer.offset
-    tool, height = means_by_position(np.array(points)), dz
-    if pattern is _CONTACT:
-        tool, height = tool - [dx, dy, 0.0], 0.0
+    offset, height = (np.zeros(3), dz) if triggered else (np.array([dx, dy, 0.0]), 0.0)
+    tool = means_by_position(np.array(triggered or contact)) - offset
     return touches_at(tool, height, printer, label, root_mean_square(_ACCURACY.findall(text)))
+
+
+def _drop_last_place(points: list[tuple[float, float, float]]) -> None:
+    """Remove all samples at the place of the last one."""
+    place = points[-1][:2] if points else None
+    while points and points[-1][:2] == place:
+        points.pop()
 
 
 def mesh_touches(config: KlipperConfig, printer: Printer) -> Touches | None:
@@ -153,7 +159,11 @@ def mesh_touches(config: KlipperConfig, printer: Printer) -> Touches | None:
     Of several profiles the one with the name ``default``. Raises InputError for a mesh whose
     probed points or heights do not follow from the configuration.
     """
-    names = [name for name in config.entries if name.startswith("bed_mesh ")]
+    names = [
+        name
+        for name, entries in config.entries.items()
+        if name.startswith("bed_mesh ") and "points" in entries
+    ]
     if not names:
         return None
     section = "bed_mesh default" if "bed_mesh default" in names else names[0]

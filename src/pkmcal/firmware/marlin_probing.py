@@ -35,7 +35,7 @@ from pkmcal.firmware.contract import (
     root_mean_square,
     touches_at,
 )
-from pkmcal.firmware.towers import Command, commands
+from pkmcal.firmware.towers import commands
 
 MOST_GRID_POINTS = 100
 """Bound on the points of a grid's row or column."""
@@ -49,7 +49,6 @@ _PLACELESS = {
     "Bed Topography Report": "a map of heights without its places",
     "G33 Auto Calibrate": "the output of a G33 whose places or values in force it does not contain",
 }
-_GRID_ROW = re.compile(r"(?:^|[^\d.+-])(\d{1,2})((?:[ ]+(?:[-+]?\d{1,3}\.\d{1,6}|=+))+)\s*$")
 _G33_RADIUS = re.compile(rf"Checking\.\.\. AC at radius:\s*{NUMBER}")
 _G33_VALUE = re.compile(r"(?<![A-Za-z])(c|xy?|yz?|zx?):\s*([-+]?\d{1,4}\.\d{1,6})")
 
@@ -97,15 +96,20 @@ def _offset(printer: Printer, label: str) -> Array:
 
 
 def _last_command(text: str, code: str, line: int) -> dict[str, float] | None:
-    """Words of the last command of a code up to a line of the text; None without one."""
-    before: list[Command] = [one for one in commands(text, (code,)) if one.line <= line]
-    words: dict[str, float] = {}
-    for word in before[-1].rest.upper().split() if before else ():
+    """Words of the last command of a code up to a line of the text; None without one.
+
+    Marlin's answers begin with the code as well, but their words are no letters with numbers.
+    """
+    last = None
+    for command in commands(text, (code,)):
+        words = command.rest.upper().split()
         try:
-            words[word[0]] = float(word[1:] or 0)
+            values = {word[0]: float(word[1:] or 0) for word in words}
         except ValueError:
-            return None
-    return words if before else None
+            continue
+        if command.line <= line:
+            last = values
+    return last
 
 
 def _grid_points(text: str, label: str, printer: Printer) -> Array | None:
@@ -117,10 +121,10 @@ def _grid_points(text: str, label: str, printer: Printer) -> Array | None:
         return None
     rows: list[list[float]] = []
     for line in lines[start + 2 :]:
-        row = _GRID_ROW.search(line)
-        if row is None or int(row[1]) != len(rows) or len(rows) == MOST_GRID_POINTS:
+        row = _grid_row(line, len(rows))
+        if not row or len(rows) == MOST_GRID_POINTS:
             break
-        rows.append([np.nan if "=" in word else float(word) for word in row[2].split()])
+        rows.append(row)
     left, right, front, back = (words[c] for c in "LRFB")
     sizes = {len(row) for row in rows}
     in_order = -LARGEST_PRINTER_VALUE < left < 0 < right < LARGEST_PRINTER_VALUE
@@ -143,6 +147,15 @@ def _grid_points(text: str, label: str, printer: Printer) -> Array | None:
         most = np.linalg.norm(on_axes - shift, axis=-1).max()
         probed &= np.linalg.norm(grid - shift, axis=-1) <= most * (1 + 1e-9)
     return np.column_stack([grid[probed] - beside, z[probed]])
+
+
+def _grid_row(line: str, number: int) -> list[float]:
+    """Heights behind the row's number, NaN for marks of points without; none for another line."""
+    _, _, heights = f" {line} ".partition(f" {number} ")
+    try:
+        return [np.nan if set(word) == {"="} else float(word) for word in heights.split()]
+    except ValueError:
+        return []
 
 
 def _g33_points(text: str, label: str, printer: Printer) -> Array | None:

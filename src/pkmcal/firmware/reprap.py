@@ -65,6 +65,7 @@ _OWN_COMMAND = re.compile(
 )
 """Commands, or their words, that Marlin has not: M666 A and B are the bed's tilt."""
 _M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
+_PRINT_RADIUS = re.compile(r"^[^\S\n]*M665\b[^;\n]*\sB", re.MULTILINE)
 _OURS = re.compile(r"\s*M66[56]\b")
 HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
 _G30 = re.compile(r"^[^\S\n]*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
@@ -106,12 +107,14 @@ class RepRap(Firmware):
         """
         label = path.name
         words, places = _checked_words(text, label)
-        rod, radius, height, reach = (
+        rod, radius, height = (
             _words(words, label, "665" + letter, size)
-            for letter, size in (("L", 3), ("R", 1), ("H", 1), ("B", 1))
+            for letter, size in (("L", 3), ("R", 1), ("H", 1))
         )
+        # without B the print radius is what was set before
+        reach = _words(words, label, "665B", 1) if _PRINT_RADIUS.search(text) else None
         for name, values in (("665L", rod), ("665R", radius), ("665H", height), ("665B", reach)):
-            if values.min() <= 0:
+            if values is not None and values.min() <= 0:
                 raise InputError(
                     f"M665 {name[-1]} is no number that a printer can have",
                     where=places[name],
@@ -135,7 +138,7 @@ class RepRap(Firmware):
             angle=np.array(REPRAP_TOWER_ANGLES) + corrections,
             rod=rod,
             homed=ends,
-            reach=float(reach[0]),
+            reach=None if reach is None else float(reach[0]),
             carriages=partial(reprap_carriage_heights, command),
             step=CARRIAGE_STEP if steps is None else float(1 / steps.min()),
             steps=steps,
@@ -340,7 +343,7 @@ def _words(words: dict[str, Array], label: str, name: str, size: int) -> Array:
             where=label,
             found=f"{len(values)} numbers",
             expected="one, or one for each tower" if size > 1 else "one",
-            next_step="Name the file in which M665 has L, R, H and B: after M500 that is"
+            next_step="Name the file in which M665 has L, R and H: after M500 that is"
             " config-override.g",
         )
     return np.broadcast_to(values, (size,)).copy()
@@ -369,7 +372,15 @@ def _height_map_points(text: str, label: str) -> Array:
             )
         return value
 
-    # names of newer and older versions of RepRapFirmware
+    axes = [numbers.get(name, letter) for name, letter in (("axis0", "X"), ("axis1", "Y"))]
+    if axes != ["X", "Y"]:
+        raise InputError(
+            "the height map is not of the axes X and Y",
+            where=f"{label}, line 3",
+            found=", ".join(axes),
+            expected="X,Y",
+        )
+    # names since 3.3, since 1.19 and before, of RepRapFirmware
     x0, y0 = number_under("xmin", "min0"), number_under("ymin", "min1")
     dx = number_under("xspacing", "spacing0", "spacing", above=0.0)
     dy = number_under("yspacing", "spacing1", "spacing", above=0.0)

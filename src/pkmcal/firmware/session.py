@@ -167,16 +167,15 @@ def printer_session_texts(
     """Files of a printer's session by name; arguments as for `write_printer_session`."""
     delta = read_printer(printer, firmware)
     if in_view is None:
-        # points that do not depend on the printer's values come first in its own file
-        if probed is None:
-            touches, distances = read_measured(printer, delta, own=True)
-            touches = delta.touches or touches
-        else:
-            touches, distances = read_measured(probed, delta)
-            touches = touches or (delta.touches if distances else None)
-        printed = _of_pairs(distances or delta.distances)
-        if part is not None:
-            printed = read_part(part, delta)
+        # of the printer's own file, points that do not depend on its values come first
+        touches, distances = delta.touches, delta.distances
+        if probed is not None:
+            points, pairs = read_measured(probed, delta)
+            touches, distances = points or touches, pairs or distances
+        elif touches is None:
+            touches, pairs = read_measured(printer, delta, own=True)
+            distances = pairs or distances
+        printed = _of_pairs(distances) if part is None else read_part(part, delta)
         return heights_texts(delta, _checked_touches(delta, touches), printed)
     return carried_texts(delta, places)
 

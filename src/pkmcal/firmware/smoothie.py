@@ -67,7 +67,8 @@ CONFIG_WORDS = {
 }
 """Words of commands by keys of the file config."""
 _HEADING = re.compile(r";\s*(Optional arm solution specific settings|Max Z\s*$)", re.MULTILINE)
-_CONFIG_LINE = re.compile(r"([a-z][a-z0-9_.]*)\s+(\S+)")
+_CONFIG_LINE = re.compile(r"([a-z][a-z0-9_.]*)\s+([^\s=:]\S*)")
+"""Key and value; with = or : between, the line is of another program, such as Klipper."""
 
 
 @final

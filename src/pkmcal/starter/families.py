@@ -17,7 +17,6 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import closest
-from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.ranges import FAMILY_DIMENSIONS
 from pkmcal.starter.nominal import NominalLeg, NominalModel, millimetres, option_of
 from pkmcal.wording import listed
@@ -293,13 +292,10 @@ def family_model(name: str | None, given: Numbers) -> NominalModel:
         numbers.get("tube_radius"),
         tuple(assumed),
     )  # fmt: skip
-    if model.machine().forward_result(model.readings()).singularity[0] < NEAR_SINGULAR:
-        raise InputError(
-            "the platform could move with all motors at rest: its pose at home is singular",
-            where="--machine",
-            found=name,
-            expected="base and platform of different shapes, such as smaller spacings of the pairs",
-        )
+    model.check_home(
+        "--machine",
+        "base and platform of different shapes, such as smaller spacings of the pairs",
+    )
     return model
 
 

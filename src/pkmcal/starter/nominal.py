@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array, short_repr
+from pkmcal.errors import InputError
 from pkmcal.files import parse_yaml, validated_document
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 
 TOLERANCE_SHARE, LARGEST_TOLERANCE = 0.02, 0.002
 """Standard deviation of a centre relative to the longest leg, and its largest value, m: a ruler
@@ -61,12 +63,22 @@ class NominalLeg:
 
     @classmethod
     def crank(
-        cls, center: Array, axis: Array, zero: Array, arm: float, platform: Array, rod: float
+        cls,
+        center: Array,
+        axis: Array,
+        zero: Array,
+        arm: float,
+        platform: Array,
+        rod: float,
+        sweep: tuple[float, float] | None = None,
     ) -> NominalLeg:
-        """Rod on a crank; axis, zero : unit vectors, zero that of the arm at reading 0."""
+        """Rod on a crank; axis, zero : unit vectors, zero that of the arm at reading 0. sweep : its
+        least and largest reading, degrees.
+        """
+        ends = "" if sweep is None else f", range: [{sweep[0]:.10g} deg, {sweep[1]:.10g} deg]"
         base = (
             f"{{joint: crank, center: {_numbers(center)}, axis: {_direction(axis)},"
-            f" zero: {_direction(zero)}, arm: {millimetres(arm)}}}"
+            f" zero: {_direction(zero)}, arm: {millimetres(arm)}{ends}}}"
         )
         return cls(base, _constant(rod), center + arm * zero, platform, rod)
 
@@ -128,10 +140,20 @@ class NominalModel:
         document = parse_yaml(self.text(), Path("mechanism.yaml"))
         return checked_machine(validated_document(document, MechanismDocument), document)
 
-    def readings(self) -> Array:
-        """Readings (1, m) at home."""
+    def check_home(self, where: str, expected: str | None = None) -> None:
+        """Raise InputError for a model whose platform could move at home with all motors at rest.
+
+        where, expected : of the message.
+        """
         machine = self.machine()
-        return machine.inverse(machine.home()[None])
+        readings = machine.inverse(machine.home()[None])
+        if machine.forward_result(readings).singularity[0] < NEAR_SINGULAR:
+            raise InputError(
+                "the platform could move with all motors at rest: its pose at home is singular",
+                where=where,
+                found=self.name,
+                expected=expected,
+            )
 
     def _lengths(self) -> Array:
         """Distances (L,) of A and B at home, m."""
