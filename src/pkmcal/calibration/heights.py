@@ -70,13 +70,12 @@ def probed_heights(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> ProbedHeights:
     """Heights of a session with their errors; empty without any."""
+    if not session.trackers:
+        none, nothing = np.zeros(0, dtype=int), np.zeros(0)
+        no = np.zeros(0, dtype=bool)
+        return ProbedHeights(none, none, nothing, nothing, nothing, nothing, nothing, no)
     poses, rows = measurements.poses, height_rows(measurements)
     configuration, station = poses.configuration[rows], poses.station[rows]
-    if not rows.size:
-        none = np.zeros(0)
-        return ProbedHeights(
-            configuration, station, none, none, none, none, none, none.astype(bool)
-        )
     state, machine, statistics = estimate.state, estimate.machine, estimate.statistics
     T_station_base = state.T_camera_base[station]
     joints = session.joints[configuration]
