@@ -272,6 +272,33 @@ def test_samples_before_a_retry_are_dropped_and_accuracy_is_the_noise(tmp_path):
     assert session["stations"]["probe"]["tracker"]["noise"]["position"] == "0.00354 mm"
 
 
+def logged(text):
+    """The configuration of a printer.cfg as Klipper writes it into klippy.log."""
+    lines = [line.removeprefix("#*#").strip() for line in text.splitlines()]
+    rows = [line.replace(": ", " = ", 1) for line in lines if not line.startswith(("<", "DO"))]
+    return "\n".join(["===== Config file =====", *rows, "======================="]) + "\n"
+
+
+def test_a_log_has_the_configuration_and_what_was_probed_with_it(tmp_path):
+    """Of two configurations the last one, and only the points below it."""
+    old = logged(PROBE + CFG.replace("delta_radius: 105.0", "delta_radius: 100.0"))
+    points = "".join(f"probe at {x:.3f},{y:.3f} is z=1.25\n" for x, y in printers.bed(8))
+    text = f"Git version: 'v0.12'\n{old}{points}Stats 1.0: gcodein=0\n"
+    text += f"Restarting printer\n{logged(PROBE + CFG)}Stats 2.0: gcodein=0\n"
+    log = files(tmp_path, klippy_log=text)
+    printer = read_printer(log)
+    assert (printer.radius, printer.offset) == (105.0, (12.0, -5.5, 1.25))
+    np.testing.assert_allclose(printer.homed, SAYS.homed)
+    assert read_measured(log, printer, own=True) == (None, None)
+    log.write_text(text + points)
+    touches, _ = read_measured(log, read_printer(log), own=True)
+    np.testing.assert_allclose(
+        touches.carriages - 1.25, SAYS.carriages(np.pad(printers.bed(8), ((0, 0), (0, 1)))),
+        atol=1e-3,
+    )  # fmt: skip
+    assert run("new", tmp_path / "kit", "--printer", log).code == 0
+
+
 def part_marks(scale=1.0):
     """Marks (12, 2, 3) mm of Klipper's calibration object, from its pillars at 65 mm."""
     a = np.deg2rad([210, 270, 330, 30, 90, 150])

@@ -113,6 +113,7 @@ WRONG = {
     ROTARY.replace("position_endstop: 250", "position_endstop: 2500"): "do not reach",
     ROTARY.replace("position_endstop: 250", "position_endstop: -10"): "do not reach",
     WINCH.replace("anchor_z: 3000", "anchor_z: 60000"): "too far",
+    WINCH.replace("anchor_z: 3000", "anchor_z: 0"): "no length at home",
     WINCH.replace("anchor_z: 3000", ""): "missing: anchor_z",
     WINCH.partition("[stepper_d]")[0].replace("anchor_z: -100", "anchor_z: 0"): "singular",
 }

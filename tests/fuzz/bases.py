@@ -102,6 +102,36 @@ def delta_printers(folder: Path) -> None:
     )
     lines = [f"// probe at {x:.3f},{y:.3f} is z=1.{k}" for k, (x, y) in enumerate(places)]
     (folder / "console.txt").write_text("\n".join(lines))
+    (folder / "towers.cfg").write_text("[stepper_b]\nangle: 330.1\n")
+    (folder / "mesh.cfg").write_text(
+        "[include towers.cfg]\n[bed_mesh]\nmesh_radius: 80\nfaulty_region_1_min: 30, 30\n"
+        + "faulty_region_1_max: 60, 60\n" + printers.printer_cfg(printers.Settings())
+        + "#*# [bed_mesh default]\n#*# points =\n" + 5 * "#*# \t 0.1, 0.2, 0.1, 0.0, 0.1\n"
+        + "#*# x_count = 5\n#*# y_count = 5\n#*# min_x = -80\n#*# max_x = 80\n#*# min_y = -80\n"
+        "#*# max_y = 80\n"
+    )  # fmt: skip
+    six = ",".join(6 * ["74.1"])
+    (folder / "part.log").write_text(
+        "\n".join(lines) + "\nProbe samples exceed tolerance. Retrying...\n"
+        f"DELTA_ANALYZE CENTER_DISTS={six} OUTER_DISTS={six}\nprobe accuracy results: range 0.1,"
+        " standard deviation 0.003\nDELTA_ANALYZE CENTER_PILLAR_WIDTHS = [9.1, 9.0, 9.2]\n"
+        f"DELTA_ANALYZE OUTER_PILLAR_WIDTHS={six.replace('74', '9')} SCALE=1\n"
+    )
+    (folder / "grid.txt").write_text(
+        "G29 L-60 R60 F-60 B60\nBilinear Leveling Grid:\n      0      1      2\n"
+        + "".join(f" {k}{7 * ' +0.010'}\n" for k in range(7))
+    )
+    arms = "".join(f"[stepper_{s}]\nupper_arm_length: 170\nlower_arm_length: 320\n"
+                   "position_endstop: 252\n" for s in "abc")  # fmt: skip
+    (folder / "rotary.cfg").write_text(
+        f"[printer]\nkinematics: rotary_delta\nshoulder_radius: 34\nshoulder_height: 413\n{arms}"
+    )
+    anchors = [(0, -2000, -100), (2000, 1000, -100), (-2000, 1000, -100), (0, 0, 3000)]
+    (folder / "winch.cfg").write_text(
+        "[printer]\nkinematics: winch\n"
+        + "".join(f"[stepper_{s}]\nanchor_x: {x}\nanchor_y: {y}\nanchor_z: {z}\n"
+                  for s, (x, y, z) in zip("abcd", anchors, strict=True))
+    )  # fmt: skip
     lines = [f"G30 P{k} X{x:.1f} Y{y:.1f} Z-99999" for k, (x, y) in enumerate(places)]
     (folder / "bed.g").write_text("\n".join([*lines, f"G32 bed probe heights:{' 0.1' * 8}, mean"]))
     rows = "".join("0, 0.01, -0.02, 0.030\n" for _ in range(4))

@@ -41,7 +41,7 @@ from pkmcal.exporters.delta import (
     value_sigmas,
     workspace_radius,
 )
-from pkmcal.files import LARGEST_WRITTEN_FILE, closest, quoted, read_text
+from pkmcal.files import closest, quoted, read_text
 from pkmcal.outcome.finding import Finding
 from pkmcal.wording import listed
 
@@ -338,7 +338,7 @@ def read_printer(path: Path, firmware: str | None = None) -> Printer:
     printer that is not a linear delta.
     """
     label = path.name
-    text = read_text(path, largest=LARGEST_WRITTEN_FILE)
+    text = read_text(path)
     return buildable_delta(firmware_of(text, label, firmware).printer(text, path))
 
 

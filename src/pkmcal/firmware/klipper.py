@@ -47,7 +47,7 @@ from pkmcal.firmware.contract import (
     Touches,
     WrittenValues,
 )
-from pkmcal.firmware.klipper_config import KlipperConfig, read_config
+from pkmcal.firmware.klipper_config import KlipperConfig, console_of, read_config
 from pkmcal.firmware.klipper_probing import (
     KLIPPER_STEPPERS,
     analyzed_distances,
@@ -74,7 +74,7 @@ class Klipper(Firmware):
     name: ClassVar = "klipper"
     title: ClassVar = "Klipper: values for printer.cfg"
     program: ClassVar = "Klipper"
-    configuration: ClassVar = "a printer.cfg with a section [printer] (Klipper)"
+    configuration: ClassVar = "a printer.cfg with a section [printer], or klippy.log (Klipper)"
     file: ClassVar = "pkmcal_printer.cfg"
     comment: ClassVar = "#"
     motors: ClassVar = ("stepper_a", "stepper_b", "stepper_c")
@@ -145,14 +145,14 @@ class Klipper(Firmware):
 
     def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
         """Points of PROBE in a console's output or klippy.log, or of a saved mesh of the bed."""
-        touches = probed_touches(text, path.name, printer)
+        touches = probed_touches(console_of(text), path.name, printer)
         if touches is None and "[bed_mesh" in text:
             return mesh_touches(read_config(text, path), printer)
         return touches
 
     def distances(self, text: str, label: str, printer: Printer) -> PartDistances | None:
         """Distances of DELTA_ANALYZE."""
-        return analyzed_distances(text, label, printer)
+        return analyzed_distances(console_of(text), label, printer)
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Sections of printer.cfg under a header of comments."""

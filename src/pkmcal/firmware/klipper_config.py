@@ -8,6 +8,9 @@ SAVE_CONFIG writes lines that begin with ``#*#``. A value that also occurs above
 or in an included file is taken from there. If a line below SAVE_CONFIG's header lacks the mark, or
 a marked line precedes the header, Klipper ignores the whole saved block (_find_autosave_data).
 
+At its start Klipper writes its whole configuration into klippy.log, included files and saved values
+in their places. What stands below was printed with these values.
+
 Until 2021 ``step_distance``, the carriage's travel for one step, stood in place of
 ``rotation_distance``, the travel for one revolution of the motor.
 """
@@ -34,6 +37,8 @@ FULL_STEPS = 200.0
 MOST_INCLUDED_FILES = 64
 MOST_WILDCARD_PARTS = 3
 """Bound on the folders and files of an include that have wildcards, as links may make a circle."""
+LOG_HEADING, LOG_END = "===== Config file =====", "======================="
+"""Lines before and after a configuration in klippy.log."""
 _HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>")
 _SECTION = re.compile(r"\[([^\]]+)\]")
 _ENTRY = re.compile(r"([A-Za-z_]\w*)\s*[:=](.*)")
@@ -176,12 +181,15 @@ class KlipperConfig:
 def read_config(text: str, path: Path) -> KlipperConfig:
     """Read a configuration and the files that it includes.
 
-    path : of the text. Raises InputError for a saved block that Klipper would ignore, and for
-    includes that cannot be followed: in a circle, of too many files, by wildcards beyond the
-    folder, of files that are no text.
+    path : of the text, which can be a klippy.log; the last configuration in it counts. Raises
+    InputError for a saved block that Klipper would ignore, and for includes that cannot be
+    followed: in a circle, of too many files, by wildcards beyond the folder, of no text.
     """
-    _check_saved(text, path.name)
-    lines = [(f"{path.name}, line {n}", line) for n, line in enumerate(text.splitlines(), 1)]
+    numbered = [(f"{path.name}, line {n}", line) for n, line in enumerate(text.splitlines(), 1)]
+    start, end = _logged(text)
+    lines = numbered[start:end]
+    if not start:
+        _check_saved(text, path.name)
     own = [line for line in lines if not line[1].startswith(SAVED_LINE_MARK)]
     saved = [
         (place, line.removeprefix(SAVED_LINE_MARK).removeprefix(" "))
@@ -194,6 +202,24 @@ def read_config(text: str, path: Path) -> KlipperConfig:
     for chunk in (saved, *includes.chunks(own, path, ())):
         _parse(chunk, entries)
     return KlipperConfig(path.name, entries, tuple(includes.missing))
+
+
+def console_of(text: str) -> str:
+    """What Klipper printed below its last configuration in a klippy.log; other texts are whole."""
+    start, end = _logged(text)
+    return "\n".join(text.splitlines()[end:]) if start else text
+
+
+def _logged(text: str) -> tuple[int, int]:
+    """First line of the last configuration in a klippy.log and the line after it, from 0; all lines
+    of another text.
+    """
+    lines = text.splitlines()
+    start = max((n for n, line in enumerate(lines, 1) if line == LOG_HEADING), default=0)
+    if not start:
+        return 0, len(lines)
+    end = next((n for n, line in enumerate(lines[start:], start) if line == LOG_END), len(lines))
+    return start, end
 
 
 def _parse(lines: Iterable[Line], entries: Sections) -> None:

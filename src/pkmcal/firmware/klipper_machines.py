@@ -27,6 +27,8 @@ from pkmcal.starter.nominal import NominalLeg, NominalModel
 ARM_MARGIN_BELOW = 5.0
 """Margin below the arms' lowest positions above the bed, degrees."""
 STEEPEST_ARM = 90.0
+SHORTEST_CABLE = 1.0
+"""Shortest length of a cable at home, mm."""
 UP = np.array([0.0, 0.0, 1.0])
 OTHER_KINEMATICS: Mapping[str, str] = {
     "delta": "a linear delta is read with --printer FILE",
@@ -134,6 +136,14 @@ def _winch(config: KlipperConfig) -> NominalModel:
     anchors = np.array([
         [config.number(name, f"anchor_{c}") for c in "xyz"] for name in (*names[:3], *more)
     ])  # fmt: skip
+    for name, anchor in zip(names, anchors, strict=False):
+        if np.linalg.norm(anchor) < SHORTEST_CABLE:
+            raise InputError(
+                "this cable has no length at home, the origin",
+                where=f"{config.label}, [{name}]",
+                found=", ".join(f"{value:g}" for value in anchor) + " mm",
+                expected="an anchor away from the origin",
+            )
     return _checked(
         NominalModel(
             "klipper-winch",

@@ -227,7 +227,8 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
             "there is no probed point of the bed",
             where=printer.label,
             expected="a section [delta_calibrate] with height0 and height0_pos, which Klipper's"
-            " DELTA_CALIBRATE and SAVE_CONFIG write, or Marlin's lines 'Bed X: Y: Z:'",
+            " DELTA_CALIBRATE and SAVE_CONFIG write, a mesh that Klipper saved, or Marlin's lines"
+            " 'Bed X: Y: Z:'",
             next_step="Name the printer's console output of a probing with --probed FILE; or"
             " --board, for a session with a camera",
         )

@@ -40,6 +40,16 @@ def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> N
     unit : of a HAL file, ``mm`` or ``inch``. given : dimensions besides the centres, m. Raises
     InputError for another file, missing centres, and legs that do not reach.
     """
+    text = read_text(path)
+    of_hal = _PIN.search(text) is not None
+    if not of_hal and path.suffix.lower() != ".csv":
+        raise InputError(
+            "the file has no machine that can be read",
+            where=path.name,
+            expected="LinuxCNC's lines 'setp genhexkins.base.0.x VALUE', a .csv table with the"
+            f" header {EXPECTED_HEADER}, or Klipper's section [printer] with kinematics"
+            " rotary_delta or winch",
+        )
     if "leg" not in given or any(name not in (*NEEDS, *TAKES) for name in given):
         raise InputError(
             "joint centres need the legs' length at home, and no other radius, spacing or arm",
@@ -47,23 +57,15 @@ def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> N
             found=listed([option_of(name) for name in given]) or "no --leg",
             expected="--leg LENGTH, and where known --travel and --tube-radius",
         )
-    text = read_text(path)
     remarks: tuple[str, ...] = ()
-    if _PIN.search(text):
+    if of_hal:
         base, platform, remarks = _of_hal(text, path.name, unit)
-    elif path.suffix.lower() == ".csv":
+    else:
         if unit is not None:
             raise InputError(
                 "a table names its units in its header", where="--unit", expected=EXPECTED_HEADER
             )
         base, platform = _of_table(text, path.name)
-    else:
-        raise InputError(
-            "the file has no joint centres that can be read",
-            where=path.name,
-            expected="LinuxCNC's lines 'setp genhexkins.base.0.x VALUE', or a .csv table with the"
-            f" header {EXPECTED_HEADER}",
-        )
     largest = float(np.abs([base, platform]).max())
     if largest > LARGEST_UNITLESS_LENGTH:
         raise InputError(
