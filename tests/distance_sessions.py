@@ -30,29 +30,23 @@ def write(folder, true, rng, *, describe=None, noise=0.015, places=13, caliper=C
     describe = describe or printers.Settings()
     readings = printers.felt(true, printers.bed(places), noise, rng)
     (folder / "printer.cfg").write_text(printers.printer_cfg(describe, readings))
-    write_printer_session(folder / "kit", folder / "printer.cfg")
-    add_distances(folder / "kit", true, rng, describe, caliper, pairs)
+    (folder / "part.yaml").write_text(part(true, rng, describe, caliper, pairs))
+    write_printer_session(folder / "kit", folder / "printer.cfg", part=folder / "part.yaml")
     return folder / "kit"
 
 
-def add_distances(kit, true, rng, describe, caliper=CALIPER, pairs=None):
-    """Adds marks to joints.csv, distances.csv, and its key to session.yaml."""
-    pairs = PAIRS if pairs is None else pairs
-    at = marks()
-    carriages = describe.carriages(np.column_stack([at, np.full(len(at), 0.2)]))
-    there = 1e3 * true.forward(1e-3 * carriages)[:, :3, 3]
-    text = (kit / "joints.csv").read_text()
-    rows = [f"m{k:02d}," + ",".join(repr(float(x)) for x in c) for k, c in enumerate(carriages)]
-    (kit / "joints.csv").write_text(text + "\n".join(rows) + "\n")
-    lines = ["from,to,distance [mm]"]
-    for a, b in pairs:
-        apart = np.linalg.norm(there[b] - there[a]) + caliper * rng.normal()
-        lines.append(f"m{a:02d},m{b:02d},{float(apart)!r}")
-    (kit / "distances.csv").write_text("\n".join(lines) + "\n")
-    session = (kit / "session.yaml").read_text()
-    (kit / "session.yaml").write_text(
-        session + f"\ndistances:\n  file: distances.csv\n  noise: {caliper} mm\n"
-    )
+def part(true, rng, describe, caliper=CALIPER, pairs=None, shrinkage=0.0):
+    """File of a printed part, as calipers measure it outside and inside."""
+    at = np.column_stack([marks(), np.full(len(marks()), 0.2)])
+    there = 1e3 * true.forward(1e-3 * describe.carriages(at))[:, :3, 3] * (1 - shrinkage)
+    lines = ["unit: mm", f"noise: {caliper}", f"shrinkage: {shrinkage}", "marks:"]
+    lines += [f"  m{k:02d}: [{x!r}, {y!r}, {z!r}]" for k, (x, y, z) in enumerate(at.tolist())]
+    lines.append("distances:")
+    for a, b in PAIRS if pairs is None else pairs:
+        apart = float(np.linalg.norm(there[b] - there[a]) + caliper * rng.normal())
+        both = f"outside: {apart + 4.8!r}, inside: {apart - 4.8!r}"
+        lines.append(f"  - {{between: [m{a:02d}, m{b:02d}], {both}}}")
+    return "\n".join(lines) + "\n"
 
 
 def stretch(true, value):

@@ -243,7 +243,6 @@ def test_faults_of_the_table(kit, tmp_path, text, line, words):
 @pytest.mark.parametrize(
     ("new", "words"),
     [
-        ("distances:\n  file: distances.csv\n", "noise"),
         ("distances:\n  file: distance.csv\n  noise: 0.02 mm\n", "distance.csv"),
         ("distances:\n  file: distances.csv\n  noise: 0.2\n", "size"),
         ("distances:\n  file: distances.csv\n  noise: 1 deg\n", "deg"),

@@ -12,6 +12,7 @@ import pytest
 
 import printers
 from conftest import run
+from page_documents import page_document
 from pkmcal.boards.board import load_board
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.machine_source import MachineSource, load_source
@@ -99,6 +100,51 @@ def test_it_is_accepted_for_the_bed_and_states_what_it_is_not_good_for(kit):
     assert bed["unnoticed"] < 0.2 * bed["by_drawing"]
     page = (kit / "calibration" / "report.html").read_text(encoding="utf-8")
     assert "How flat will the bed be?" in page
+
+
+def test_every_height_before_and_after(kit, true):
+    """Before: the firmware's own account, its mean taken off. After: within the noise."""
+    saved = load(kit / "calibration")
+    heights = saved.document["heights"]
+    assert [one["configuration"] for one in heights] == [f"{k:03d}" for k in range(1, 20)]
+    joints = read_csv(kit / "joints.csv").values
+    felt_at = load_mechanism(kit / "mechanism.yaml").forward(joints)[:, 2, 3]
+    before, after, sigma, x, y = (
+        np.array([one[key] for one in heights]) for key in ("before", "after", "sigma", "x", "y")
+    )
+    np.testing.assert_allclose(before, felt_at - felt_at.mean(), atol=1e-9)
+    assert np.std(before) > 1e-4
+    # the probe's default, with a share of the carriages' steps
+    assert np.all((sigma > 20e-6) & (sigma < 21e-6))
+    assert 0.3 * NOISE < 1e3 * np.sqrt(np.mean(after**2)) < NOISE
+    np.testing.assert_allclose(1e3 * np.column_stack([x, y]), printers.bed(19), atol=1.0)
+    page = page_document((kit / "calibration" / "report.html").read_text(encoding="utf-8"))
+    (part,) = (one for one in page["sections"] if one["name"] == "heights")
+    (table,) = (block for block in part["blocks"] if block["kind"] == "table")
+    names = [row["cells"][0] for row in table["rows"]]
+    order = np.argsort(-np.abs(after / sigma))
+    assert names == [heights[k]["configuration"] for k in order]
+    assert [row["cells"][-1] for row in table["rows"]] == ["worst"] + 18 * ["used"]
+    text = run("calibrate", kit, "-o", kit.parent / "again").out
+    assert f"{names[0]} at x" in text
+
+
+def test_the_origin_of_the_noise_is_stated(kit, tmp_path):
+    session = load_session(kit)
+    assert session.trackers[0].position == 20e-6
+    (finding,) = (one for one in session.findings if one.code == "session.default_noise")
+    assert finding.facts["sigma"] == 20e-6
+    assert "PROBE_ACCURACY" in finding.text
+    assert not session.warnings
+    for path in kit.glob("*.*"):
+        (tmp_path / path.name).write_text(path.read_text())
+    text = (tmp_path / "session.yaml").read_text()
+    (tmp_path / "session.yaml").write_text(
+        text.replace("# noise: {position: 0.02", "noise: {position: 0.015")
+    )
+    stated = load_session(tmp_path)
+    assert stated.trackers[0].position == 15e-6
+    assert not stated.findings
 
 
 def test_what_is_pasted_puts_z_0_on_the_bed(kit, true):
@@ -663,7 +709,7 @@ def test_points_that_cannot_be_read(text, cfg):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--probed", "x"), "need the printer's configuration"),
+        (("--probed", "x"), "--printer FILE"),
         (("--printer", "x"), "the file does not exist"),
         (("--printer", "x", "--machine", "delta"), "--machine besides"),
         (("--printer", "x", "--board", "--probed", "y"), "--probed besides"),

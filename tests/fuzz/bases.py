@@ -89,6 +89,11 @@ def delta_printers(folder: Path) -> None:
         "Recv: echo:  M665 L270.00 R105.00 H300.00 S200.00 X0.10 Y0.00 Z-0.10 A0.10 B0.00 C0.00\n"
         f"Recv: echo:  M851 X0.00 Y0.00 Z-1.50\n{bed}"
     )
+    (folder / "part.yaml").write_text(
+        "unit: mm\nmarks: {middle: [0, 0, 5], a: [60, 10.5, 5], b: [-30, 51.9, 6]}\n"
+        "distances:\n  - {between: [middle, a], outside: 70.0, inside: 51.4}\n"
+        "  - {between: [a, b], apart: 98.7}\nnoise: 0.03\nshrinkage: 0.1 %\n"
+    )
     (folder / "configuration.txt").write_text(
         "#define CONFIGURATION_H_VERSION 02010205\n#define DELTA_DIAGONAL_ROD 270.0 // (mm)\n"
         "#define OFFSET 30.0\n#define DELTA_RADIUS (135.0-(OFFSET))\n#define DELTA_HEIGHT 300\n"

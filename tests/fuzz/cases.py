@@ -97,6 +97,7 @@ TASKS = (
     Task("read-camera FILE", ("cameras/*.*",), "", 10),
     Task("new OUT --printer FILE", PRINTERS, "", 4),
     Task("new OUT --printer printers/printer.cfg --probed FILE", POINTS, "", 4),
+    Task("new OUT --printer printers/printer.cfg --part FILE", ("printers/part.yaml",), "", 2),
     Task("new OUT --printer FILE", ("printers/mesh.cfg",), "", 2),
     Task("new OUT --printer printers/mesh.cfg", ("printers/towers.cfg",), "", 1),
     Task("new OUT --printer printers/printer.cfg --probed FILE", ("printers/part.log",), "", 2),

@@ -12,13 +12,15 @@ from typing import Any
 from pkmcal.api.result import Result
 from pkmcal.calibration.machine_source import MachineSource, load_source
 from pkmcal.exporters.contract import Export, exporter_of, make_export, write_export
-from pkmcal.outcome import Outcome, Verdict
+from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import note
+from pkmcal.wording import brief, decimals, number
 
 
 @dataclass(frozen=True)
 class ExportResult(Result, Export):
-    """Files for another program: ``files``, ``differences`` from the machine, ``notes``.
+    """Files for another program: ``files``, ``differences`` from the machine, ``notes``, and
+    ``values`` under the program's own names.
 
     source : the machine and its calibration.
     """
@@ -38,9 +40,24 @@ class ExportResult(Result, Export):
             title=f"{source.machine.name} as {self.exporter.title}",
             verdict=Verdict(True, f"{source.origin}: {source.headline}"),
             partial=not (source.calibrated and source.usable),
+            parts=self._parts(),
             findings=(*compared, *self.notes),
             document=self._document(),
         )
+
+    def _parts(self) -> tuple[Part, ...]:
+        """Table of the values with their standard deviations, where these are known."""
+        rows: list[Row] = []
+        for one in self.values:
+            if one.sigma is not None:
+                sigma = brief(one.sigma) if one.sigma else "exact"
+                rows.append(
+                    Row(one.name, (number(one.value, decimals(one.sigma)), sigma, one.unit))
+                )
+        if not rows:
+            return ()
+        columns = ("Name", "Value", "σ", "Unit")
+        return (Part("values", "Values", tables=(Table("", columns, tuple(rows), words=(3,)),)),)
 
     def _document(self) -> dict[str, Any]:
         """Document for programs, without paths."""
@@ -54,6 +71,7 @@ class ExportResult(Result, Export):
                 {"what": d.what, "largest": d.largest, "limit": d.limit, "unit": d.unit}
                 for d in self.differences
             ],
+            "values": [one._asdict() for one in self.values],
             "notes": [{"level": one.level.value, "text": one.text} for one in self.notes],
         }
 
@@ -108,7 +126,7 @@ def export(
     Returns
     -------
     ExportResult
-        ``files``, ``differences``, ``notes``, ``summary()``, ``save(folder)``.
+        ``files``, ``differences``, ``notes``, ``values``, ``summary()``, ``save(folder)``.
 
     Raises
     ------

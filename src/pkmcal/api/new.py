@@ -35,7 +35,7 @@ PROBED_FILE_DESCRIPTIONS = {
     "mechanism.yaml": PRINTER_MECHANISM_DESCRIPTION,
     "joints.csv": "the carriages when the bed was probed",
     "poses.csv": "the tool's height above the bed there",
-    "distances.csv": "the distances on the printed part",
+    "distances.csv": "distances on the printed part",
 }
 """Descriptions of the files of a complete session of a printer."""
 IMAGES_DESCRIPTION = "where the images go"
@@ -114,6 +114,7 @@ def new(
     places: int | None = None,
     printer: Path | str | None = None,
     probed: Path | str | None = None,
+    part: Path | str | None = None,
     firmware: str | None = None,
     from_file: Path | str | None = None,
     unit: str | None = None,
@@ -147,6 +148,9 @@ def new(
         heights of its bed unless ``board``.
     probed :
         Console output of a printer that probed its bed; by default the heights in ``printer``.
+    part :
+        Distances on a printed part, beside the heights: a YAML file with the commanded positions of
+        its marks.
     firmware :
         ``klipper``, ``marlin``, ``repetier``, ``reprap`` or ``smoothie``, for a ``printer`` that
         does not show which it is of.
@@ -202,7 +206,7 @@ def new(
             where="--firmware",
             expected="--printer FILE besides",
         )
-    if printer is None and probed is None:
+    if printer is None and probed is None and part is None:
         what = "both" if board and legs else "board" if board else "legs" if legs else None
         nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
         return NewResult(
@@ -211,12 +215,13 @@ def new(
         )
     if printer is None:
         raise InputError(
-            "probed points need the printer's configuration",
-            where="--probed",
+            "a printer's measurements need its configuration",
+            where="--part" if probed is None else "--probed",
             expected="--printer FILE besides: its printer.cfg, its config.g with M665, or what M503"
             " printed",
         )
-    others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
+    others = {"--machine": machine, "--legs": legs}
+    others |= {"--probed": probed, "--part": part} if board else {}
     others |= {"--from": from_file, "--unit": unit}
     others |= {option_of(name): True for name in dimensions}
     if extra := [name for name, given in others.items() if given]:
@@ -232,6 +237,7 @@ def new(
         "board" if board else None,
         places or 1,
         firmware,
+        None if part is None else Path(part),
     )
     return NewResult(texts, of_printer=True, complete=not board)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, get_args
 
@@ -34,6 +34,7 @@ from pkmcal.calibration.faults import (
     size_notes,
 )
 from pkmcal.calibration.handheld import inconsistent_poses, localize_case, without_misplaced
+from pkmcal.calibration.heights import ProbedHeights, probed_heights
 from pkmcal.calibration.image_rotation import UpsideDown, rotation_finding, upside_down
 from pkmcal.calibration.leg_numbering import numbering_note
 from pkmcal.calibration.localization import (
@@ -126,6 +127,11 @@ class Calibration(CalibrationSummary):
     def machine(self) -> Machine:
         """The calibrated machine."""
         return self.estimate.machine
+
+    @cached_property
+    def heights(self) -> ProbedHeights:
+        """Heights above a bed before and after; empty without any."""
+        return probed_heights(self.session, self.measurements, self.estimate)
 
     def overview(self) -> Overview:
         """The figures of its summary."""

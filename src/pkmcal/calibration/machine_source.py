@@ -19,6 +19,7 @@ from pkmcal.cameras.files import camera_path, load_camera, written_camera
 from pkmcal.errors import InputError, legible
 from pkmcal.files import closest, resolved
 from pkmcal.geometry.rigid import inverse
+from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
@@ -41,6 +42,8 @@ class MachineSource:
     frames : the gauge.
     sigma_camera : (6,) by station, of T_base_camera, rad and m, base axes.
     bed : z (m, base frame) of the platform's origin on a bed whose heights were measured, or None.
+    bed_by_parameters, bed_sigma : (P,) its derivative by the parameters, at the readings with which
+        the bed was probed, and its standard deviation (m) beside them; None where unknown.
     session : the calibration's session and its digest, as text; empty for a nominal model.
     """
 
@@ -63,6 +66,8 @@ class MachineSource:
         default_factory=lambda: MappingProxyType(dict[str, Array]())
     )
     bed: float | None = None
+    bed_by_parameters: Array | None = None
+    bed_sigma: float | None = None
     session: str = ""
 
     @property
@@ -175,6 +180,7 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
     sigma = {s.name: np.append(s.sigma_rotation, s.sigma_translation) for s in saved.stations}
     # a bed's position along itself is undetermined by heights: not a pose to export
     placed = [s for s in saved.stations if np.isfinite(sigma[s.name]).all()]
+    bed_by, bed_sigma = _bed_uncertainty(saved)
     return MachineSource(
         machine=saved.machine,
         sigma=saved.sigma,
@@ -189,6 +195,8 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
         calibrated=True,
         frames=saved.gauge,
         bed=_bed(saved),
+        bed_by_parameters=bed_by,
+        bed_sigma=bed_sigma,
         session=session_words if session_entry else "",
     )
 
@@ -210,6 +218,21 @@ def _bed(saved: SavedCalibration) -> float | None:
             target = np.array(mount)
             return -float(inverse(station.T_base_camera)[2, 3] + target[2, 3])
     return None
+
+
+def _bed_uncertainty(saved: SavedCalibration) -> tuple[Array, float] | tuple[None, None]:
+    """Derivative (P,) of the bed's height by the parameters, and its standard deviation beside
+    them.
+
+    The bed is the weighted mean of the heights that the machine has at the probed readings.
+    """
+    heights = [one for one in saved.document.get("heights") or () if one["used"]]
+    if not heights:
+        return None, None
+    rows = [saved.configurations.index(one["configuration"]) for one in heights]
+    weight = np.array([one["sigma"] for one in heights]) ** -2.0
+    by = pose_by_parameters(saved.machine, saved.joints[rows], saved.T_base_platform[rows])[:, 5]
+    return weight @ by / weight.sum(), float(weight.sum() ** -0.5)
 
 
 def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, islice
+from itertools import groupby, islice, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +38,8 @@ from pkmcal.identify.tool import ToolAccuracy, tool_error
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Column, Measurements, Observation
 from pkmcal.measurements.effects import columns_of_effects
+from pkmcal.mechanisms import machine_from_document
+from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.closure import scales as scales_of
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
@@ -212,7 +214,7 @@ def _detection(
     shift = float(np.sqrt(np.nanmean(shifted**2)))
     sigma = float(np.sqrt(np.nanmean(tool.position**2)))
     ratio = shift / sigma if sigma > 0 else np.inf  # where nothing that is free moves the tool
-    level = Level.WRONG if ratio > MOST_TOOL_SHIFT else Level.DOUBTFUL
+    level = Level.WRONG if ratio > MOST_TOOL_SHIFT and not one.remark else Level.DOUBTFUL
     # what the data do not determine is no number
     facts = {
         name: None if isinstance(value, float) and not np.isfinite(value) else value
@@ -374,5 +376,46 @@ def _tripods(
         yield from station_movement.movement_columns(s, name, used, session.configurations, what)
 
 
-TESTED = (_reading_scales, _reading_plays, _lenses, _lenses_of_stations, _boards, _tripods)
+def _leaning_towers(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Sliders that stand in other directions than the mechanism file fixes, by two angles each."""
+    del session, observation
+    machine, used = estimate.machine, estimate.configurations
+    table, layout, document = machine.parameters, machine.layout, machine.document
+    fixed = [axis for axis in table.axes if table.names[axis[0]] in table.fixed]
+    sliders = [leg for leg, one in enumerate(document.legs) if one.base.joint == "slider"]
+    if not fixed or not sliders:
+        return
+    # a slider that leans by x moves its limb's end as another reading does:
+    # dc/dreading * dreading = dc/daxis * x
+    opened = machine_from_document(document.model_copy(update={"fixed": ()})).parameters
+    directions = opened.free_matrix()
+    at = closure(
+        layout, machine.values, measured.joints[used], estimate.state.T_base_platform[used]
+    )
+    slope = at.by_reading[..., None] * layout.of_motor
+    by_theta = slope.mT @ dense(at, len(table)) / np.sum(slope**2, axis=1)[..., None]
+    for leg, axis in product(sliders, fixed):
+        if table.names[axis[0]] != f"legs[{leg + 1}].base.axis.x":
+            continue
+        own = np.any(directions[axis] != 0, axis=0)
+        by = np.zeros((*measured.joints.shape, 2))
+        by[used] = by_theta @ directions[:, own]
+        yield Column(
+            "machine.lean", f"leg {leg + 1}", "lean", readings=by, facts=_of_lean, remark=True
+        )
+
+
+def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
+    """Facts about a lean by two angles (2,), rad."""
+    size = float(np.linalg.norm(value))
+    spread = float(np.linalg.norm(value * sigma)) / size if size else float(np.max(sigma))
+    return {"value": size, "sigma": spread, "angles": value.tolist()}
+
+
+TESTED = (
+    _reading_scales, _reading_plays, _leaning_towers, _lenses, _lenses_of_stations, _boards,
+    _tripods,
+)  # fmt: skip
 """What a session takes for granted and that may be otherwise; each is a family of columns."""

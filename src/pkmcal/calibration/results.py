@@ -184,6 +184,7 @@ def calibration_document(
         "edge_noise": _edge_noise(estimate),
         "tool": {"why_not": over} if isinstance(over, str) else over and over.document(),
         "bed": bed and asdict(bed),
+        "heights": calibration.heights.document(session),
         "holdout": holdout,
         "residuals": _residuals(calibration),
         "rejected": _rejected(calibration),

@@ -41,6 +41,10 @@ def _dimension(name: str, described: str, usual: str = "") -> Any:
     ),
     option("--probed", "FILE", "Terminal output of the printer's bed probing.", Path),
     option(
+        "--part", "FILE", "Distances on a printed part, beside the heights: a YAML file with the"
+        " commanded positions of its marks.", Path,
+    ),
+    option(
         "--firmware", "NAME", "Printer's firmware, if its file does not show it: klipper, marlin,"
         " repetier, reprap or smoothie.",
     ),

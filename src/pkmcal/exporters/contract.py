@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from inspect import isabstract
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -51,6 +51,18 @@ class Difference:
         return not self.largest <= self.limit
 
 
+class ExportedValue(NamedTuple):
+    """Value of a file under the target program's own name, and its standard deviation.
+
+    unit : mm, degrees or steps. sigma : None for a machine without a covariance.
+    """
+
+    name: str
+    value: float
+    unit: str
+    sigma: float | None = None
+
+
 class Exporter(ABC):
     """Format. Exporters are stateless; all data come from the source.
 
@@ -76,6 +88,13 @@ class Exporter(ABC):
     @abstractmethod
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Differences between the texts, read as the target program reads them, and the machine."""
+
+    def values(self, source: MachineSource) -> tuple[ExportedValue, ...]:
+        """Values that the target program has names for; none where it takes the machine's own
+        parameters.
+        """
+        del source
+        return ()
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """Findings on the use of the files."""
@@ -112,12 +131,13 @@ def exporter_of(name: str) -> Exporter:
 
 @dataclass(frozen=True)
 class Export:
-    """Texts by file name, their differences from the machine, and findings on their use."""
+    """Texts by file name, their differences from the machine, findings on their use, and values."""
 
     exporter: Exporter
     files: dict[str, str]
     differences: tuple[Difference, ...]
     notes: tuple[Finding, ...]
+    values: tuple[ExportedValue, ...]
 
 
 def make_export(source: MachineSource, name: str, *, force: bool = False) -> Export:
@@ -146,7 +166,8 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
                 expected=f"at most {difference.limit:.3g} {difference.unit}",
                 next_step="This is a defect of pkmcal: report it, with the mechanism file",
             )
-    return Export(exporter, files, differences, tuple(exporter.notes(source)))
+    notes, values = tuple(exporter.notes(source)), exporter.values(source)
+    return Export(exporter, files, differences, notes, values)
 
 
 def write_export(made: Export, folder: Path) -> None:

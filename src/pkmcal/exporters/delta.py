@@ -32,6 +32,7 @@ from pkmcal.exporters.limbs import (
     rod_limbs,
 )
 from pkmcal.geometry.rigid import apply, dot, pose, rotation
+from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import Finding, doubtful, note
 
@@ -68,6 +69,8 @@ upright.
 """
 STEPS_ROUNDING = 1e-4
 """Tolerance of motor steps per mm."""
+VALUE_STEP = 1e-3
+"""Step of numerical derivatives by a fit's parameters, mm or degrees."""
 TOOL_ROUNDING = 2e-6
 """Tolerance at the tool, m: settings have 0.1 µm and 0.00001 degrees, amplified up to eightfold."""
 _ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
@@ -395,6 +398,56 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
             " machine with --to c",
         )
     return fit
+
+
+def value_sigmas(
+    fit: Fit, freedoms: Freedoms, source: MachineSource, values: Callable[[Fit], Array]
+) -> Array | None:
+    """Standard deviations (k,) of a firmware's values; None for a machine without a covariance.
+
+    The fit's parameters x minimise the tool's error r(x, theta) over the grid, so that ``dx = -J^+
+    dr`` with J = dr/dx. A change of the machine, or of the bed's height, moves the tool at given
+    motor positions: dr is that displacement. Scales of readings change no motor position.
+
+    values : (k,) by the firmware's own formulas from a fit.
+    """
+    if source.covariance is None:
+        return None
+    delta, machine = fit.delta, source.machine
+    # the tool's error by the fit's parameters, (3 n, x)
+    packed = _ParameterVector(fit, freedoms)
+    readings = delta.readings[:, fit.order]
+    by_reading = MM_A_METRE * delta.by_reading[:, :, fit.order]
+
+    def off(x: Array) -> Array:
+        return _tool_error(packed.fit(x), delta.positions, readings, by_reading).ravel()
+
+    by_fit = _differences(off, packed.zeros)
+    # by the machine's parameters, and by the bed's height, which lowers the firmware's frame
+    joints = np.zeros_like(delta.readings)
+    joints[:, delta.joint] = delta.readings
+    by_machine = MM_A_METRE * pose_by_parameters(machine, joints, delta.poses)[:, 3:]
+    by_machine[..., machine.parameters.of_kind("scale")] = 0.0
+    by_bed = np.zeros((len(joints), 3, 1))
+    by_bed[:, 2] = -MM_A_METRE
+    displaced = np.concatenate([by_machine, by_bed], axis=2).reshape(len(by_fit), -1)
+    by_source = -np.linalg.lstsq(by_fit, displaced, rcond=None)[0]
+    # covariance of the parameters and the bed
+    n = len(source.covariance)
+    root = np.eye(n + 1, n)
+    if source.bed_by_parameters is not None:
+        root[n] = source.bed_by_parameters
+    covariance = root @ source.covariance @ root.T
+    covariance[n, n] += (source.bed_sigma or 0.0) ** 2
+    by_values = _differences(lambda x: values(packed.fit(x)), packed.zeros) @ by_source
+    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by_values, covariance, by_values), 0.0))
+
+
+def _differences(function: Callable[[Array], Array], at: Array) -> Array:
+    """Derivative (n, x) by central differences of VALUE_STEP."""
+    steps = VALUE_STEP * np.eye(len(at))
+    columns = [(function(at + step) - function(at - step)) / (2 * VALUE_STEP) for step in steps]
+    return np.stack(columns, axis=1)
 
 
 def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) -> Array:

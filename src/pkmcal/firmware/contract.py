@@ -18,7 +18,14 @@ import numpy as np
 from pkmcal.arrays import Array, short_repr
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Difference, Exporter, exporters, largest
+from pkmcal.exporters.contract import (
+    Difference,
+    ExportedValue,
+    Exporter,
+    commented,
+    exporters,
+    largest,
+)
 from pkmcal.exporters.delta import (
     STEPS_ROUNDING,
     SWITCH_ROUNDING,
@@ -31,6 +38,7 @@ from pkmcal.exporters.delta import (
     readings_elsewhere,
     redo,
     switch_values,
+    value_sigmas,
     workspace_radius,
 )
 from pkmcal.files import closest, quoted, read_text
@@ -155,6 +163,7 @@ class Firmware(Exporter, ABC):
     program : its name.
     configuration : the files that are read, in words.
     file : name of the exported file.
+    comment : mark of a comment in the exported file.
     motors : names of the motors.
     carriage_source : where a user reads the heights of the carriages, in two lines.
     linear, rotary : free parameters of its kinematics; `rotary` is None without a rotary one.
@@ -163,6 +172,7 @@ class Firmware(Exporter, ABC):
     program: ClassVar[str]
     configuration: ClassVar[str]
     file: ClassVar[str]
+    comment: ClassVar[str] = ";"
     motors: ClassVar[tuple[str, str, str]] = ("X", "Y", "Z")
     carriage_source: ClassVar[str]
     linear: ClassVar[Freedoms] = Freedoms(TOWER_ANGLES)
@@ -202,6 +212,14 @@ class Firmware(Exporter, ABC):
         """Text of the exported file. Raises InputError for values that the firmware refuses."""
 
     @abstractmethod
+    def named_values(self, fit: Fit, at: Fit) -> tuple[ExportedValue, ...]:
+        """Values of the exported text that a calibration determines, under the firmware's names,
+        before rounding.
+
+        at : the exported fit, whose choices (such as the lowest switch) hold for fits beside it.
+        """
+
+    @abstractmethod
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values of an exported text."""
 
@@ -219,7 +237,29 @@ class Firmware(Exporter, ABC):
 
     def files(self, source: MachineSource) -> dict[str, str]:
         """The exported file; pins, speeds and the like remain the printer's own."""
-        return {self.file: self.text(self.fit(source), source)}
+        text = self.text(self.fit(source), source)
+        lines = [
+            f"{one.name} = {one.value:.6g} {one.unit}, sigma {one.sigma:.2g}"
+            for one in self.values(source)
+            if one.sigma is not None
+        ]
+        head = ["Values and their standard deviations, before rounding:"] if lines else []
+        return {self.file: text + commented([*head, *lines], self.comment)}
+
+    def values(self, source: MachineSource) -> tuple[ExportedValue, ...]:
+        """The firmware's values, with the standard deviations that the calibration gives them."""
+        fit = self.fit(source)
+        freedoms = self.linear if fit.kind == "linear" or self.rotary is None else self.rotary
+
+        def numbers(beside: Fit) -> Array:
+            return np.array([one.value for one in self.named_values(beside, fit)])
+
+        values, sigmas = self.named_values(fit, fit), value_sigmas(fit, freedoms, source, numbers)
+        if sigmas is None:
+            return values
+        return tuple(
+            one._replace(sigma=sigma) for one, sigma in zip(values, sigmas.tolist(), strict=True)
+        )
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Differences by the firmware's formulas, with values read as the firmware reads them."""

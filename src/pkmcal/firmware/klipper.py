@@ -25,7 +25,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import commented
+from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import (
     DEGREES_A_RADIAN,
     SWITCH_ROUNDING,
@@ -76,6 +76,7 @@ class Klipper(Firmware):
     program: ClassVar = "Klipper"
     configuration: ClassVar = "a printer.cfg with a section [printer], or klippy.log (Klipper)"
     file: ClassVar = "pkmcal_printer.cfg"
+    comment: ClassVar = "#"
     motors: ClassVar = ("stepper_a", "stepper_b", "stepper_c")
     rotary: ClassVar = Freedoms(ROTARY_ANGLES, heights=False)
     carriage_source: ClassVar = "what Klipper's\nGET_POSITION prints behind stepper:"
@@ -184,6 +185,27 @@ class Klipper(Firmware):
         """None: Klipper has rotation_distance instead, with the printer's gears."""
         del fit
         return None
+
+    def named_values(self, fit: Fit, at: Fit) -> tuple[ExportedValue, ...]:
+        """Options of [printer] and of the steppers."""
+        del at
+        if fit.kind == "linear":
+            common = (("delta_radius", fit.radius),)
+            each = (("arm_length", fit.rod, "mm"), ("angle", fit.angle, "degrees"),
+                    ("position_endstop", _tower_endstops(fit), "mm"))  # fmt: skip
+        else:
+            common = (("shoulder_radius", fit.radius), ("shoulder_height", fit.height[0]))
+            each = (("upper_arm_length", fit.arm, "mm"), ("lower_arm_length", fit.rod, "mm"),
+                    ("angle", fit.angle, "degrees"),
+                    ("position_endstop", _arm_endstops(fit, fit.end_motors), "mm"))  # fmt: skip
+        return (
+            *(ExportedValue(name, float(value), "mm") for name, value in common),
+            *(
+                ExportedValue(f"stepper_{s}.{name}", float(values[k]), unit)
+                for k, s in enumerate(KLIPPER_STEPPERS)
+                for name, values, unit in each
+            ),
+        )
 
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values as Klipper reads them."""

@@ -33,7 +33,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Difference, commented, largest
+from pkmcal.exporters.contract import Difference, ExportedValue, commented, largest
 from pkmcal.exporters.delta import (
     Fit,
     about,
@@ -54,12 +54,14 @@ from pkmcal.firmware.contract import (
 from pkmcal.firmware.definitions import Definitions
 from pkmcal.firmware.marlin_probing import marlin_touches
 from pkmcal.firmware.towers import (
+    SettingNames,
     Settings,
     Words,
     commands,
     fitted_settings,
     impossible,
     lettered,
+    named_settings,
     read_commands,
     stated_height,
     switch_lines,
@@ -185,6 +187,20 @@ class Marlin(Firmware):
             + "\n"
             + commented(["The same in Configuration.h:", *defines], ";")
         )
+
+    def named_values(self, fit: Fit, at: Fit) -> tuple[ExportedValue, ...]:
+        """Letters of M665 and M666; without H where it is not written."""
+        offset = height_offset(fit.delta.machine)
+        letters = SettingNames(
+            rod="M665 L",
+            radius="M665 R",
+            height="M665 H",
+            angles=("M665 X", "M665 Y", "M665 Z"),
+            trims=("M665 A", "M665 B", "M665 C"),
+            switches=("M666 X", "M666 Y", "M666 Z"),
+        )
+        values = named_settings(letters, fit, at, LEAST_RETRACTION, offset or 0.0)
+        return tuple(one for one in values if offset is not None or one.name != letters.height)
 
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values as Marlin reads them; the print radius is one of Configuration.h alone."""

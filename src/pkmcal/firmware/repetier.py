@@ -22,7 +22,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import commented
+from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
@@ -33,10 +33,12 @@ from pkmcal.firmware.contract import (
     WrittenValues,
 )
 from pkmcal.firmware.towers import (
+    SettingNames,
     Settings,
     Words,
     fitted_settings,
     impossible,
+    named_settings,
     switch_lines,
     written_values,
 )
@@ -134,6 +136,26 @@ class Repetier(Firmware):
                 " [80, 80, 80]",
             )
         return np.array(steps)
+
+    def named_values(self, fit: Fit, at: Fit) -> tuple[ExportedValue, ...]:
+        """Values of the EEPROM by position; end switches in motor steps."""
+        position = SettingNames(
+            rod=f"EPR {ROD}",
+            radius=f"EPR {RADIUS}",
+            height=f"EPR {HEIGHT}",
+            angles=("EPR 901", "EPR 905", "EPR 909"),
+            trims=("EPR 933", "EPR 937", "EPR 941"),
+            switches=("EPR 893", "EPR 895", "EPR 897"),
+        )
+        values, steps = named_settings(position, fit, at), self.steps(fit)
+        alpha = dict(zip(position.angles, TOWER_ANGLES, strict=True))
+        switch = dict(zip(position.switches, -steps, strict=True))
+        return tuple(
+            one._replace(value=one.value * switch[one.name], unit="steps")
+            if one.name in switch
+            else one._replace(value=one.value + alpha.get(one.name, 0.0))
+            for one in values
+        )
 
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values as Repetier-Firmware reads them, but for its rounding of towers and rods to motor

@@ -25,7 +25,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import commented
+from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import (
     DEGREES_A_RADIAN,
     MM_A_METRE,
@@ -168,6 +168,30 @@ class RepRap(Firmware):
         if steps is not None:
             commands.append(f"M92 {_letters(steps, firmware_length)} ; behind M350, steps per mm")
         return commented(lines, ";") + "\n".join(commands) + "\n"
+
+    def named_values(self, fit: Fit, at: Fit) -> tuple[ExportedValue, ...]:
+        """Letters of M665 and M666, or of M669 and M666 for arms."""
+        del at
+        corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
+        linear = fit.kind == "linear"
+        if linear:
+            homed = float((fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)).mean())
+            common = (("M665 R", fit.radius, "mm"), ("M665 H", homed, "mm"))
+            lists = (("M665 L", fit.rod),)
+        else:
+            common = (("M669 R", fit.radius, "mm"),)
+            lists = (("M669 U", fit.arm), ("M669 L", fit.rod), ("M669 H", fit.height))
+        command, unit = ("M665", "mm") if linear else ("M669", "degrees")
+        numbers = (
+            *common,
+            *((f"{name}, {c}", value, "mm") for name, values in lists
+              for c, value in zip("XYZ", values, strict=True)),
+            *((f"{command} {c}", value, "degrees")
+              for c, value in zip("XYZ", corrections, strict=True)),
+            *((f"M666 {c}", value, unit)
+              for c, value in zip("XYZ", _adjustments(fit), strict=True)),
+        )  # fmt: skip
+        return tuple(ExportedValue(name, float(value), unit) for name, value, unit in numbers)
 
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values as RepRapFirmware reads them."""

@@ -7,10 +7,15 @@ from typing import Literal
 
 import numpy as np
 
+from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
 from pkmcal.firmware.contract import CARRIAGE_STEP, PartDistances, Printer, Touches, read_printer
+from pkmcal.firmware.part import PrintedPart, read_part
 from pkmcal.firmware.probed import FEWEST_BED_POINTS, read_measured
+from pkmcal.measurements.contract import MeasurementKind
+from pkmcal.measurements.distances import Distances
+from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import MechanismDocument, checked_machine
 from pkmcal.starter import (
     STARTER_SQUARE_CHOICES,
@@ -78,6 +83,9 @@ joints:
 FIRMWARE_FIXED_TEXT = """\
 # What the firmware can hold: towers upright, motors that move as far as it commands.
 fixed: ["legs[*].platform.center", "legs[*].base.axis", "legs[*].scale"]
+# pkmcal calibrate --model leaning estimates the towers' directions as well, two angles each.
+models:
+  leaning: {fixed: ["legs[*].platform.center", "legs[*].scale"]}
 """
 PLATFORM_FIXED_TEXT = """\
 fixed: ["legs[*].platform.center"]
@@ -96,27 +104,32 @@ stations:
   probe:
     tracker:
       poses: poses.csv        # the tool's height above the bed
-      # Standard deviation of the probe: {sigma_origin}. A bed
-      # that is not flat to that counts as well, and is reported.
-      noise: {{position: {sigma} mm}}
+{probe_noise}      # A bed that is not flat to that counts as well, and is reported.
       level: true             # the firmware's Z is counted from the bed
 
 """
-NO_DISTANCES_TEXT = """\
-# Heights do not determine how large a part comes out. Distances between marks of the tool do: the
-# carriages at each mark as further rows of joints.csv, and a table from,to,distance [mm].
-# distances:
-#   file: distances.csv
-#   noise: 0.03 mm            # how well they repeat
+DEFAULT_PROBE_TEXT = """\
+      # Standard deviation of the probe: Klipper's PROBE_ACCURACY and Marlin's M48 print yours;
+      # {sigma} is pkmcal's default.
+      # noise: {{position: {sigma}}}
 """
-DISTANCES_TEXT = """\
-# Distances on a printed part; where they come from: {origin}.
+PROBE_TEXT = """\
+      noise: {{position: {sigma}}}  # standard deviation of the probe, as that file has it
+"""
+NO_PART_TEXT = """\
+# Heights do not determine how large a part comes out. Distances on a printed part do: write them
+# into a file, and make the session again with --part FILE.
+"""
+PART_TEXT = """\
+# Distances on a printed part, by {label}{shrinkage}.
+# Further rows of joints.csv are the carriages at its marks, by the firmware's values.
 distances:
   file: distances.csv
-  noise: 0.03 mm              # how well they repeat: calipers on a printed part, some 0.03 mm
 """
-DEFAULT_PROBE_SIGMA = 0.02
-"""Standard deviation of a probe, mm, of files that do not state it."""
+DEFAULT_CALIPER_TEXT = """\
+  # Standard deviation of a distance; {sigma} is pkmcal's default.
+  # noise: {sigma}
+"""
 
 
 def write_printer_session(
@@ -126,6 +139,7 @@ def write_printer_session(
     in_view: Literal["board"] | None = None,
     places: int = 1,
     firmware: str | None = None,
+    part: Path | None = None,
 ) -> tuple[str, ...]:
     """Write a printer's session into a new or empty folder and return the names of its files.
 
@@ -134,10 +148,12 @@ def write_printer_session(
     in_view : ``board`` for a session with a board on the tool; None for a session of heights.
     places : number of stations of a session with a board.
     firmware : the firmware's name, for a file that does not show it.
+    part : file of a printed part, beside heights.
 
     Raises InputError for files that lack necessary values.
     """
-    return write_texts(folder, printer_session_texts(printer, probed, in_view, places, firmware))
+    texts = printer_session_texts(printer, probed, in_view, places, firmware, part)
+    return write_texts(folder, texts)
 
 
 def printer_session_texts(
@@ -146,6 +162,7 @@ def printer_session_texts(
     in_view: Literal["board"] | None = None,
     places: int = 1,
     firmware: str | None = None,
+    part: Path | None = None,
 ) -> dict[str, str]:
     """Files of a printer's session by name; arguments as for `write_printer_session`."""
     delta = read_printer(printer, firmware)
@@ -153,12 +170,13 @@ def printer_session_texts(
         # of the printer's own file, points that do not depend on its values come first
         touches, distances = delta.touches, delta.distances
         if probed is not None:
-            points, part = read_measured(probed, delta)
-            touches, distances = points or touches, part or distances
+            points, pairs = read_measured(probed, delta)
+            touches, distances = points or touches, pairs or distances
         elif touches is None:
-            touches, part = read_measured(printer, delta, own=True)
-            distances = part or distances
-        return heights_texts(delta, _checked_touches(delta, touches), distances)
+            touches, pairs = read_measured(printer, delta, own=True)
+            distances = pairs or distances
+        printed = _of_pairs(distances) if part is None else read_part(part, delta)
+        return heights_texts(delta, _checked_touches(delta, touches), printed)
     return carried_texts(delta, places)
 
 
@@ -242,51 +260,74 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
 
 
 def heights_texts(
-    printer: Printer, touches: Touches, distances: PartDistances | None = None
+    printer: Printer, touches: Touches, part: PrintedPart | None = None
 ) -> dict[str, str]:
     """Files by name of a session of bed heights, and of distances on a printed part."""
-    names = [f"{k + 1:03d}" for k in range(len(touches.heights))]
+    heights = [f"{k + 1:03d}" for k in range(len(touches.heights))]
     heads = [f"{motor} [mm]" for motor in printer.firmware.motors]
-    sigma = DEFAULT_PROBE_SIGMA if touches.sigma is None else touches.sigma
+    names, carriages, distances = heights, touches.carriages, dict[str, str]()
+    if part is not None:
+        names, carriages = [*heights, *part.names], np.concatenate([carriages, part.carriages])
+        distances["distances.csv"] = _distances_text(part)
     session = PROBED_SESSION_TEXT.format(
-        n=len(names),
+        n=len(heights),
         origin=legible(touches.origin),
         to=printer.firmware.name,
-        sigma=f"{sigma:.3g}",
-        sigma_origin="Klipper's PROBE_ACCURACY and Marlin's M48 print it"
+        probe_noise=DEFAULT_PROBE_TEXT.format(sigma=_default_sigma(Heights))
         if touches.sigma is None
-        else "as that file has it",
+        else PROBE_TEXT.format(sigma=f"{touches.sigma:.3g} mm"),
         **_resolution(printer),
     )
-    poses = csv_text(["z [mm]"], names, touches.heights[:, None])
-    mechanism = nominal_text(printer, touches, distances) + FIRMWARE_FIXED_TEXT
-    carriages = touches.carriages
-    texts = {"poses.csv": poses, "mechanism.yaml": mechanism}
-    if distances is None:
-        session += NO_DISTANCES_TEXT
-    else:
-        session += DISTANCES_TEXT.format(origin=legible(distances.origin))
-        pairs = [(f"m{k:02d}a", f"m{k:02d}b") for k in range(1, len(distances.values) + 1)]
-        rows = zip(pairs, distances.values, strict=True)
-        texts["distances.csv"] = "from,to,distance [mm]\n" + "".join(
-            f"{first},{second},{value:.6g}\n" for (first, second), value in rows
-        )
-        names += [name for pair in pairs for name in pair]
-        marks = np.stack([distances.first, distances.second], axis=1).reshape(-1, 3)
-        carriages = np.vstack([carriages, marks])
     return {
-        "session.yaml": session,
-        **texts,
+        "session.yaml": session + (NO_PART_TEXT if part is None else _part_text(part)),
+        "mechanism.yaml": nominal_text(printer, carriages) + FIRMWARE_FIXED_TEXT,
         "joints.csv": csv_text(heads, names, carriages.round(6)),
+        "poses.csv": csv_text(["z [mm]"], heights, touches.heights[:, None]),
+        **distances,
     }
 
 
-def nominal_text(
-    printer: Printer, touches: Touches | None = None, distances: PartDistances | None = None
-) -> str:
+def _of_pairs(distances: PartDistances | None) -> PrintedPart | None:
+    """The part of distances that have two marks of their own each."""
+    if distances is None:
+        return None
+    n = len(distances.values)
+    return PrintedPart(
+        label=distances.origin,
+        names=tuple(f"m{k:02d}{end}" for k in range(1, n + 1) for end in "ab"),
+        carriages=np.stack([distances.first, distances.second], axis=1).reshape(-1, 3),
+        between=np.arange(2 * n).reshape(n, 2),
+        distance=distances.values,
+    )
+
+
+def _part_text(part: PrintedPart) -> str:
+    """Entry ``distances`` of session.yaml."""
+    shrinkage = (
+        f", whose shrinkage of {100 * part.shrinkage:g} % is undone" if part.shrinkage else ""
+    )
+    text = PART_TEXT.format(label=legible(part.label), shrinkage=shrinkage)
+    if part.noise is None:
+        return text + DEFAULT_CALIPER_TEXT.format(sigma=_default_sigma(Distances))
+    return text + f"  noise: {part.noise:g} mm\n"
+
+
+def _distances_text(part: PrintedPart) -> str:
+    """Table of the distances."""
+    rows = zip(part.between.tolist(), part.distance.round(6).tolist(), strict=True)
+    lines = [f"{part.names[a]},{part.names[b]},{value!r}" for (a, b), value in rows]
+    return "\n".join(["from,to,distance [mm]", *lines]) + "\n"
+
+
+def _default_sigma(kind: type[MeasurementKind]) -> str:
+    """Default standard deviation of a kind, mm, in words."""
+    return f"{1e3 * (kind.default_sigma or 0.0):g} mm"
+
+
+def nominal_text(printer: Printer, reached: Array | None = None) -> str:
     """Nominal model of the printer as a mechanism file, without its key ``fixed``.
 
-    touches, distances : measurements that the ranges of the carriages have to include.
+    reached : (n, 3) mm, heights of the carriages that their ranges have to include.
     """
     angle = np.deg2rad(printer.angle)
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -296,8 +337,7 @@ def nominal_text(
     # lowest carriages at the bed's edge, towards the towers and away from them, and at the touches
     with np.errstate(invalid="ignore"):
         carriages = [printer.carriages(s * edge) for s in (-1.0, 1.0)]
-    carriages += [] if touches is None else [touches.carriages]
-    carriages += [] if distances is None else [distances.first, distances.second]
+    carriages += [] if reached is None else [reached]
     lowest = float(np.nanmin(np.concatenate(carriages))) - CARRIAGE_MARGIN_BELOW
     # tool height at which the first carriage reaches its end switch, on the axis
     top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())

@@ -23,7 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import commented
+from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length, steps_correction
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
@@ -34,12 +34,14 @@ from pkmcal.firmware.contract import (
     WrittenValues,
 )
 from pkmcal.firmware.towers import (
+    SettingNames,
     Settings,
     Words,
     commands,
     fitted_settings,
     impossible,
     lettered,
+    named_settings,
     read_commands,
     switch_lines,
     written_values,
@@ -132,6 +134,18 @@ class Smoothie(Firmware):
         """None: Smoothieware has no print radius."""
         del fit
         return None
+
+    def named_values(self, fit: Fit, at: Fit) -> tuple[ExportedValue, ...]:
+        """Letters of M665 and M666."""
+        letters = SettingNames(
+            rod="M665 L",
+            radius="M665 R",
+            height="M665 Z",
+            angles=("M665 D", "M665 E", "M665 H"),
+            trims=("M665 I", "M665 J", "M665 K"),
+            switches=("M666 X", "M666 Y", "M666 Z"),
+        )
+        return named_settings(letters, fit, at)
 
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values as Smoothieware reads them."""

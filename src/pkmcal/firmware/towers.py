@@ -19,7 +19,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, short_repr
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Difference, largest
+from pkmcal.exporters.contract import Difference, ExportedValue, largest
 from pkmcal.exporters.delta import (
     DEGREES_A_RADIAN,
     SWITCH_ROUNDING,
@@ -32,6 +32,7 @@ from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     CARRIAGE_STEP,
     LARGEST_PRINTER_VALUE,
+    TOWER_ANGLES,
     Firmware,
     Printer,
     WrittenValues,
@@ -191,6 +192,42 @@ def fitted_settings(fit: Fit, least_offset: float = 0.0) -> Settings:
     small = bool(((beyond > 0) & (beyond < least_offset)).any())
     height = float(heights.min()) - (least_offset if small else 0.0)
     return Settings(fit.rod, fit.radius, fit.angle, height - heights, height)
+
+
+@dataclass(frozen=True)
+class SettingNames:
+    """A firmware's names of its settings; of each tower angle, rod's trim and switch."""
+
+    rod: str
+    radius: str
+    height: str
+    angles: tuple[str, str, str]
+    trims: tuple[str, str, str]
+    switches: tuple[str, str, str]
+
+
+def named_settings(
+    names: SettingNames, fit: Fit, at: Fit, least_offset: float = 0.0, height_offset: float = 0.0
+) -> tuple[ExportedValue, ...]:
+    """Settings of a fit before rounding: angles and rods as trims, switches as offsets, mm.
+
+    at, least_offset : of the exported settings (:func:`fitted_settings`), in which the height at
+        home is that of one switch, or lower by the least offset. height_offset : what the
+        firmware's height contains beyond.
+    """
+    exported, heights = fitted_settings(at, least_offset), nozzle_heights(fit)
+    least = int(np.argmin(nozzle_heights(at)))
+    height = heights[least] + float(np.round(exported.offset[least], 4))
+    rod = float(fit.rod.mean())
+    numbers = (
+        (names.rod, rod, "mm"),
+        (names.radius, fit.radius, "mm"),
+        (names.height, height + height_offset, "mm"),
+        *zip(names.angles, fit.angle - np.array(TOWER_ANGLES), 3 * ["degrees"], strict=True),
+        *zip(names.trims, fit.rod - rod, 3 * ["mm"], strict=True),
+        *zip(names.switches, height - heights, 3 * ["mm"], strict=True),
+    )
+    return tuple(ExportedValue(name, float(value), unit) for name, value, unit in numbers)
 
 
 def switch_lines(fit: Fit, height: float, rule: str) -> list[str]:

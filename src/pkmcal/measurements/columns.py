@@ -44,6 +44,7 @@ class Column:
     the camera or tracker of that number stands elsewhere from that configuration on, by (omega,
     tau), k = 6. Absent: no effect on these.
 
+    remark : without a prior, its finding is no reason against the result, whatever it moves.
     prior : (k, l) root L of the numbers' covariance L L^T; None where nothing is known of them.
     at : (k,) numbers at which the measurements were made, zero if absent: an estimate finds their
     change from there. facts : of its finding, from the estimates and their standard deviations
@@ -62,6 +63,7 @@ class Column:
     motion: Array | None = None
     station: int | None = None
     since: int = 0
+    remark: bool = False
     prior: Array | None = None
     at: Array | None = None
     facts: Callable[[Array, Array], Facts] = value_and_sigma

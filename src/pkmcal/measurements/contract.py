@@ -62,6 +62,9 @@ class MeasurementKind(ABC):
     unit : unit of the numbers.
     numbers : largest number of residuals of one measurement.
     joins : number of configurations on which one measurement depends.
+    default_sigma : standard deviation where a session states none, in ``unit``; None where it has
+        to be stated.
+    own_sigma : where a user finds that of his own instrument, in words.
     """
 
     code: ClassVar[str]
@@ -70,6 +73,8 @@ class MeasurementKind(ABC):
     unit: ClassVar[Literal["px", "m", "rad", "m or rad"]]
     numbers: ClassVar[int]
     joins: ClassVar[int] = 1
+    default_sigma: ClassVar[float | None] = None
+    own_sigma: ClassVar[str] = ""
 
 
 class ImageKind(MeasurementKind):

@@ -50,7 +50,7 @@ class DistancesDocument(Schema):
     file: str = Field(description="the table of distances, for example distances.csv")
     noise: Annotated[Metres, NOISE_FIELD_RANGE] | None = Field(
         default=None,
-        description="the standard deviation of a distance in metres, such as 3.0e-5",
+        description="the standard deviation of a distance in metres, such as 3.0e-5, the default",
     )
 
 
@@ -85,6 +85,8 @@ class Distances(LinkKind):
     one: ClassVar = "distance"
     label: ClassVar = "distances"
     unit: ClassVar = "m"
+    default_sigma: ClassVar[float] = 3e-5
+    own_sigma: ClassVar = "measuring some of them twice shows yours"
     key: ClassVar = "distances"
     schema: ClassVar = DistancesDocument
 
@@ -107,23 +109,14 @@ class Distances(LinkKind):
         table.check_kinds(["m"] * len(table.columns))
         rows = configuration_rows(table, names)
         column = dict(zip(table.columns, table.values.T, strict=True))
-        if SIGMA_COLUMN in column:
-            sigma = column[SIGMA_COLUMN]
-        elif node.noise is not None:
-            sigma = np.full(len(rows), node.noise)
-        else:
-            raise InputError(
-                "the distances have no stated noise",
-                where=table.label,
-                found=f"columns {', '.join((*END_COLUMNS, *table.columns))}",
-                expected=f"{cls.key}.noise in session.yaml, or a column {SIGMA_COLUMN}",
-                next_step="Calipers repeat to some 0.03 mm on printed parts: noise: 0.03 mm",
-            )
+        by_default = SIGMA_COLUMN not in column and node.noise is None
+        common = cls.default_sigma if node.noise is None else node.noise
+        sigma = column.get(SIGMA_COLUMN, np.full(len(rows), common))
         for k, value in enumerate(column[VALUE_COLUMN].tolist()):
             _check_row(table, k, value, float(sigma[k]), machine)
         none = np.zeros(len(rows), dtype=int)
         value, lines = column[VALUE_COLUMN], np.array(table.lines)
-        return DistanceSet(table.label, rows, none, value, sigma, lines)
+        return DistanceSet(table.label, rows, none, value, sigma, lines, by_default)
 
     @classmethod
     def check_start(cls, links: LinkSet, T_base_platform: Array) -> None:

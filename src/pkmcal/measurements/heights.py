@@ -28,6 +28,8 @@ class Heights(TargetKind):
     known: ClassVar = (5,)
     fewest_rows: ClassVar = 7
     levels: ClassVar = True
+    default_sigma: ClassVar[float] = 2e-5
+    own_sigma: ClassVar = "Klipper's PROBE_ACCURACY and Marlin's M48 print yours"
 
     @classmethod
     def start(cls, T_tracker_target: Array, T_base_platform: Array) -> Array | None:

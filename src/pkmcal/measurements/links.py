@@ -40,6 +40,7 @@ class LinkSet(ABC):
     mount : (N,) number of the mount on the platform.
     value, sigma : (N,) measured value and its standard deviation, SI.
     lines : (N,) lines of the table, from 1.
+    by_default : whether `sigma` is the kind's default, for the session states none.
     """
 
     label: str
@@ -48,6 +49,7 @@ class LinkSet(ABC):
     value: Array
     sigma: Array
     lines: Integers
+    by_default: bool = False
 
     __repr__ = short_repr
 

@@ -33,6 +33,7 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
     if not len(poses):
         return None
     error = errors(poses, estimate)
+    more_than_heights = bool(np.any(poses.whiten[..., :5] != 0))
     turns = (one.text for one in turning(session, poses, estimate.state.on_platform))
     return Part(
         "poses",
@@ -43,7 +44,10 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
             _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off"),
             _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned"),
         ),
-        tables=(_mounts(session, estimate), _worst(session, poses, estimate, error)),
+        tables=(
+            _mounts(session, estimate),
+            *([_worst(session, poses, estimate, error)] if more_than_heights else []),
+        ),
     )
 
 

@@ -45,12 +45,12 @@ from pkmcal.files import (
 )
 from pkmcal.geometry.rigid import look_at
 from pkmcal.measurements import LinkSet
-from pkmcal.measurements.contract import LinkKind, kinds_of
+from pkmcal.measurements.contract import LinkKind, kinds_of, measurement_kinds
 from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanism
 from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.mechanisms.region import Region
-from pkmcal.outcome.finding import Finding, doubtful
+from pkmcal.outcome.finding import Finding, Level, doubtful, note
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
 from pkmcal.session.image_files import Image, find_images, image_header, label_of
 from pkmcal.session.poses import PoseTable, read_poses
@@ -228,8 +228,8 @@ class Session:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
-        return tuple(one.text for one in self.findings)
+        """Sentences of the findings, without notes."""
+        return tuple(one.text for one in self.findings if one.level is not Level.NOTE)
 
     def label(self, number: int) -> str:
         """Name of a camera station in messages: the image's file for a hand-held one."""
@@ -298,6 +298,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     findings += _rotated_images(folder, stations)
     trackers = _trackers(folder, document, schema, table.names, measured)
     links = _links(folder, document, schema, table.names, machine) if measured else ()
+    findings += _default_noise(trackers, links)
     # Checks across files.
     if measured:
         _check_paths(document, schema, table)
@@ -687,6 +688,23 @@ def _check_tables_distinct(folder: Path, document: Document, schema: SessionDocu
                 found=table,
                 expected="its own table; a station is one instrument in one place",
             )
+
+
+def _default_noise(trackers: Sequence[PoseTable], links: Sequence[LinkSet]) -> list[Finding]:
+    """Notes on standard deviations that the session does not state."""
+    kinds = {table.label: table.kind for table in trackers if table.by_default}
+    kinds |= {one.label: one.kind for one in links if one.by_default}
+    every = measurement_kinds()
+    return [
+        note(
+            "session.default_noise",
+            label,
+            sigma=every[code].default_sigma,
+            one=every[code].one,
+            own=every[code].own_sigma,
+        )
+        for label, code in kinds.items()
+    ]
 
 
 def _check_noise(document: Document, schema: SessionDocument, machine: Machine) -> None:

@@ -36,6 +36,7 @@ class PoseTable:
     T : (N, 4, 4) T_tracker_target; what the kind does not measure is a placeholder.
     position, rotation : standard deviations, m and rad; None if not stated.
     level : whether the tracker's z axis is exactly the base's.
+    by_default : whether `position` is the kind's default, for the session states none.
     """
 
     name: str
@@ -46,6 +47,7 @@ class PoseTable:
     position: float | None
     rotation: float | None
     level: bool = False
+    by_default: bool = False
 
     __repr__ = short_repr
 
@@ -127,6 +129,16 @@ def read_poses(
     table = read_csv(path, label=label)
     kind = _kind(table)
     table.check_kinds([kind.units.get(name, "") for name in table.columns])
+    if level and not kind.levels:
+        raise InputError(
+            "level applies to heights only",
+            where=label,
+            found=f"columns {', '.join(table.columns)}",
+            expected="configuration and z",
+            next_step="Leave level out: the orientation of such a tracker is estimated",
+        )
+    by_default = position is None and kind.default_sigma is not None
+    position = kind.default_sigma if by_default else position
     for measured, sigma, what, unit, stated in (
         (kind.turns(), rotation, "orientations", "rotation", "radians"),
         (kind.shifts(), position, "positions", "position", "metres"),
@@ -148,15 +160,7 @@ def read_poses(
             expected=f"{kind.fewest_rows} at least",
         )
     T = kind.T_tracker_target(table)
-    if level and not kind.levels:
-        raise InputError(
-            "level applies to heights only",
-            where=label,
-            found=f"columns {', '.join(table.columns)}",
-            expected="configuration and z",
-            next_step="Leave level out: the orientation of such a tracker is estimated",
-        )
-    return PoseTable(name, label, kind.code, rows, T, position, rotation, level)
+    return PoseTable(name, label, kind.code, rows, T, position, rotation, level, by_default)
 
 
 def _kind(table: CsvTable) -> type[TargetKind]:

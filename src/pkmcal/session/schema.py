@@ -84,7 +84,9 @@ class TrackerDocument(Schema):
     """Entry ``tracker``: a laser tracker, a measuring machine or a probe instead of a camera."""
 
     poses: str = Field(description="the table of what it measured, for example poses.csv")
-    noise: NoiseDocument = Field(description="noise: {position: 2.0e-5, rotation: 1.0e-4}")
+    noise: NoiseDocument = Field(
+        default_factory=NoiseDocument, description="noise: {position: 2.0e-5, rotation: 1.0e-4}"
+    )
     level: bool = False
 
 
