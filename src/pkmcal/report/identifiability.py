@@ -181,8 +181,8 @@ def held_text(identification: Identification, table: ParameterTable) -> str:
     if identification.also_conventional:
         parts.append(
             f"Of these, {count(identification.also_conventional, 'combination')} would only move a"
-            " frame too, such as the heights of base joints and platform joints, of which with a camera "
-            "and a board only the sum is determined."
+            " frame too, such as the heights of base joints and platform joints, of which with a"
+            " camera and a board only the sum is determined."
         )
     return " ".join(parts)
 
