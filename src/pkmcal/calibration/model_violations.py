@@ -39,8 +39,9 @@ from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Column, Measurements, Observation
 from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms import machine_from_document
-from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.mechanisms.closure import closure, dense, limb_ends
 from pkmcal.mechanisms.closure import scales as scales_of
+from pkmcal.mechanisms.joints import screw_turns
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
 from pkmcal.session.load import Session
@@ -407,6 +408,29 @@ def _leaning_towers(
         )
 
 
+def _screw_leads(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Screws that joints turn, of another lead than the mechanism file's, or another thread."""
+    del session, observation
+    machine, used = estimate.machine, estimate.configurations
+    layout, screws = machine.layout, machine.layout.screws
+    if not len(screws):
+        return
+    joints, poses = measured.joints[used], estimate.state.T_base_platform[used]
+    ends = limb_ends(layout, machine.values, joints, poses)
+    turn = screw_turns(screws, machine.values, poses[..., :3, :3], (ends.b - ends.a)[:, screws.leg])
+    by = np.zeros((*measured.joints.shape, 1))
+    scale = scales_of(layout, machine.values)[screws.leg]
+    by[np.flatnonzero(used)[:, None], layout.actuated[screws.leg], 0] = -turn / (2 * np.pi * scale)
+
+    def facts(value: Array, sigma: Array) -> dict[str, Any]:
+        lead = float(screws.lead.mean())
+        return {"value": value[0], "sigma": sigma[0], "stated": lead, "fits": lead + value[0]}
+
+    yield Column("machine.screw_lead", "screws", "screw lead", readings=by, facts=facts)
+
+
 def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
     """Facts about a lean by two angles (2,), rad."""
     size = float(np.linalg.norm(value))
@@ -415,7 +439,7 @@ def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
 
 
 TESTED = (
-    _reading_scales, _reading_plays, _leaning_towers, _lenses, _lenses_of_stations, _boards,
-    _tripods,
+    _reading_scales, _reading_plays, _leaning_towers, _screw_leads, _lenses, _lenses_of_stations,
+    _boards, _tripods,
 )  # fmt: skip
 """What a session takes for granted and that may be otherwise; each is a family of columns."""

@@ -65,7 +65,7 @@ class MachineView:
         """Whether all legs are seen and close, and only rods constrain a rigid platform."""
         layout = self.machine.layout
         every = len(self.legs) == layout.n_legs and bool(layout.closing.all())
-        return self.rigid and every and not len(layout.angles)
+        return self.rigid and every and layout.rods_alone
 
     @cached_property
     def rigid(self) -> bool:

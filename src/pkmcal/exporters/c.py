@@ -54,8 +54,9 @@ CONVENTIONS = (
     "pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.",
     "twist: omega_x, omega_y, omega_z (rad/s), tau_x, tau_y, tau_z (m/s): R changes by omega x R,"
     " t by tau, both along the base frame's axes.",
-    "length of a rod = scale * reading + offset; a slide's way and a crank's turn are scale *"
-    " reading. Readings in the order of the machine's columns.",
+    "length of a rod = scale * reading + offset, less what a screw adds that the joints turn; a"
+    " slide's way and a crank's turn are scale * reading."
+    " Readings in the order of the machine's columns.",
     "C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all"
     " functions can run at once in several threads. Do not compile with -ffast-math.",
 )
@@ -70,6 +71,7 @@ class CSource(Exporter):
     trial: ClassVar = (
         f"cc -std=c99 -O2 pkmcal_*.c -lm -o {SELFTEST_PROGRAM} && ./{SELFTEST_PROGRAM}"
     )
+    holds_screws: ClassVar = True
     leaves: ClassVar = (SELFTEST_PROGRAM, f"{SELFTEST_PROGRAM}.exe")
 
     def files(self, source: MachineSource) -> dict[str, str]:
@@ -246,6 +248,9 @@ def _rods(machine: Machine, rods: Limbs) -> str:
             "swing": swing[k],
             "swing_rate": rate[k],
             "floating": floating[k],
+            "growth": rods.growth[k],
+            "base_axis": rods.screw_base[k],
+            "platform_axis": rods.screw_platform[k],
         }
         body = "".join(
             f"        {c_value(value)}, /* {name} */\n" for name, value in values.items()
@@ -391,6 +396,13 @@ def _records(text: str, name: str, structure: str) -> list[dict[str, Any]]:
     ]
 
 
+def twist(line: Array, first: Array, second: Array) -> Array:
+    """Angles (n,) about lines (n, 3) from axes (3,) to axes (n, 3), modulo pi."""
+    u = line / np.linalg.norm(line, axis=1, keepdims=True)
+    across = first - dot(u, first)[:, None] * u
+    return np.arctan(dot(np.cross(u, across), second) / dot(across, second))
+
+
 def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> Array:
     """Equations (n, E) of rods and axes, m, evaluated with the constants of a source.
 
@@ -420,6 +432,10 @@ def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> 
         own = rod["platform"] + np.cos(phi) * rod["swing"] + np.sin(phi) * rod["swing_rate"]
         b = (rot @ own[..., None])[..., 0] + poses[:, :3, 3] + rod["floating"]
         lines.append(b - a)
+        if rod["growth"]:
+            longer = longer - rod["growth"] * twist(
+                b - a, rod["base_axis"], rot @ rod["platform_axis"]
+            )
         out.append(np.linalg.norm(b - a, axis=1) - rod["length"] - longer)
     # axes: the rod is perpendicular to an axis, or to the normal of two
     axes = int(re.findall(r"#define AXES (\d+)", text)[0])

@@ -13,7 +13,7 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from inspect import isabstract
 from pathlib import Path
@@ -23,8 +23,9 @@ import numpy as np
 
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError, ResultError, legible
+from pkmcal.exporters.samples import samples
 from pkmcal.files import check_own_folder, closest, write_folder
-from pkmcal.outcome.finding import Finding
+from pkmcal.outcome.finding import Finding, note
 from pkmcal.wording import listed
 
 FORMAT_PACKAGES = ("pkmcal.exporters", "pkmcal.firmware")
@@ -71,12 +72,15 @@ class Exporter(ABC):
     trial : shell command that tries the files out in their folder.
     leaves : files that the trial leaves there; a later export removes them, so that an old result
         is not taken for the new one's.
+    holds_screws : whether it has the screws that joints turn; other formats take readings to be
+        lengths.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     trial: ClassVar[str] = ""
     leaves: ClassVar[tuple[str, ...]] = ()
+    holds_screws: ClassVar[bool] = False
 
     @abstractmethod
     def files(self, source: MachineSource) -> dict[str, str]:
@@ -155,6 +159,13 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
             next_step="Calibrate again; or export it with --force; its files then"
             " state that it was refused",
         )
+    more: list[Finding] = []
+    machine = source.machine
+    if len(machine.layout.screws) and not exporter.holds_screws:
+        poses, joints = samples(machine)
+        source = replace(source, machine=machine.with_screws_held())
+        change = largest(source.machine.inverse(poses), joints)
+        more.append(note("export.without_screws", program=name, largest=change))
     files = exporter.files(source)
     differences = tuple(exporter.check(files, source))
     for difference in differences:
@@ -166,7 +177,7 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
                 expected=f"at most {difference.limit:.3g} {difference.unit}",
                 next_step="This is a defect of pkmcal: report it, with the mechanism file",
             )
-    notes, values = tuple(exporter.notes(source)), exporter.values(source)
+    notes, values = (*more, *exporter.notes(source)), exporter.values(source)
     return Export(exporter, files, differences, notes, values)
 
 

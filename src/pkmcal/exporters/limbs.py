@@ -44,6 +44,9 @@ class Limbs:
     bar : (L, 3) from hinge to end; platform frame at angle zero, or base frame for ``float``.
     hinge : (L,) column of the bar's angle, -1 without.
     hinge_axis : (L, 3) unit vectors, platform frame.
+    growth : (L,) m/rad, of a screw that the joints turn: lead / (2 pi); 0 without.
+    screw_base, screw_platform : (L, 3) unit vectors, base and platform frame; a screw's axes, zero
+        without.
     """
 
     leg: Integers
@@ -59,6 +62,9 @@ class Limbs:
     bar: Array
     hinge: Integers
     hinge_axis: Array
+    growth: Array
+    screw_base: Array
+    screw_platform: Array
 
     def __len__(self) -> int:
         return len(self.leg)
@@ -101,6 +107,10 @@ def all_limbs(machine: Machine) -> Limbs:
     barred = np.array([kind != FIXED_CARRIER for kind in held])[:, None]
     driven = np.where(layout.rod_reads, TELESCOPE_ROD, shifted)
     rods = np.where(layout.rod >= 0, layout.rod, 0)
+    growth, screw_axes = np.zeros(machine.n_legs), np.zeros((2, machine.n_legs, 3))
+    screws = layout.screws
+    growth[screws.leg] = screws.lead / (2 * np.pi)
+    screw_axes[:, screws.leg] = values[screws.base], values[screws.platform]
     return Limbs(
         leg=np.arange(machine.n_legs) + 1,
         drive=tuple(np.where(layout.actuated >= 0, driven, CONSTANT_ROD).tolist()),
@@ -115,6 +125,9 @@ def all_limbs(machine: Machine) -> Limbs:
         bar=np.where(barred, bar, 0.0),
         hinge=layout.internal,
         hinge_axis=hinge_axis,
+        growth=growth,
+        screw_base=screw_axes[0],
+        screw_platform=screw_axes[1],
     )
 
 

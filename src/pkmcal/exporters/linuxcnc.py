@@ -58,7 +58,7 @@ from pkmcal.exporters.linuxcnc_module import (
     module_files,
 )
 from pkmcal.exporters.samples import samples
-from pkmcal.geometry.rigid import apply
+from pkmcal.geometry.rigid import apply, dot
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import Finding, note
 
@@ -74,7 +74,10 @@ MAX_ERROR = 500.0
 """genhexkins' default limit on the sum of the struts' errors, beyond which it gives up."""
 LINUXCNC_READING_ROUNDING = 1e-12
 """Tolerance, m: pins hold all digits; angles are converted to degrees and back."""
-_STRUT = re.compile(r"^setp genhexkins\.(base|platform)\.(\d)\.([xyz]) (\S+)$", re.M)
+_STRUT = re.compile(
+    r"^setp genhexkins\.(base|platform|base-n|platform-n)\.(\d)\.([xyz]) (\S+)$", re.M
+)
+_LEAD = re.compile(r"^setp genhexkins\.screw-lead (\S+)$", re.M)
 _PIN = re.compile(r"^setp \w+deltakins\.(\w+) (\S+)$", re.M)
 _WORD = re.compile(r"^([A-Z_]+) = (\S+)$", re.M)
 _RATE = re.compile(r"^# joint \d = (\S+) \* reading", re.M)
@@ -228,6 +231,7 @@ class LinuxCnc(Exporter):
 
     name: ClassVar = "linuxcnc"
     title: ClassVar = "LinuxCNC: kinematics, and INI words"
+    holds_screws: ClassVar = True
     leaves: ClassVar = (
         *(LINUXCNC_HAL_FILE, LINUXCNC_INI_FILE),
         *(C_HEADER_FILE, C_SOURCE_FILE, MODULE_SOURCE_FILE, f"{MODULE_NAME}.so"),
@@ -311,7 +315,34 @@ def _hexapod(machine: Machine) -> Limbs | None:
     if not ok or not layout.rod_reads[layout.closing].all() or layout.n_internal:
         return None
     struts = rod_limbs(machine)
+    if np.ptp(struts.growth) > 0:  # genhexkins has one lead for all struts
+        return None
     return struts.of(np.argsort(struts.joint))
+
+
+def _screw_pins(machine: Machine, struts: Limbs) -> list[str]:
+    """Lines of genhexkins' lead and axes.
+
+    genhexkins takes the arc sine of the turn, so axes on both ends of a strut have one sense.
+    """
+    lead = 2 * np.pi * float(struts.growth[0])
+    if lead == 0:
+        return [
+            "# screw-lead stays 0, and base-n.*, platform-n.* unused: readings are lengths.",
+        ]
+    R = machine.home()[:3, :3]
+    sense = np.sign(np.sum(struts.screw_base * (struts.screw_platform @ R.T), axis=1))
+    lines = [f"setp genhexkins.screw-lead {exact(MM_A_METRE * lead)}"]
+    for name, values in (
+        ("base-n", struts.screw_base),
+        ("platform-n", sense[:, None] * struts.screw_platform),
+    ):
+        lines += [
+            f"setp genhexkins.{name}.{n}.{axis} {exact(value)}"
+            for n, row in enumerate(values)
+            for axis, value in zip("xyz", row.tolist(), strict=True)
+        ]
+    return lines
 
 
 def _hexapod_header(source: MachineSource) -> tuple[str, ...]:
@@ -321,9 +352,9 @@ def _hexapod_header(source: MachineSource) -> tuple[str, ...]:
         " platform frame.",
         "XYZ is the platform frame's origin in the base frame; A, B, C are roll, pitch and yaw,"
         " R = Rz(C) Ry(B) Rx(A).",
-        "Joint N is the strut's length = 1000 * (scale * reading + offset); 1000 * offset is"
-        " HOME_OFFSET, and the scale belongs to the joint's own SCALE, steps or counts a mm. An"
-        " absolute encoder then counts 1000 * scale * reading.",
+        "Joint N is the strut's length, with what screw-lead adds, = 1000 * (scale * reading +"
+        " offset); 1000 * offset is HOME_OFFSET, and the scale belongs to the joint's own SCALE,"
+        " steps or counts a mm. An absolute encoder then counts 1000 * scale * reading.",
     )
 
 
@@ -356,8 +387,8 @@ def _hal(source: MachineSource, struts: Limbs) -> str:
         f"setp genhexkins.max-error {limit:.0f}",
         "",
         "# Not in this file: tool-offset (net motion.tooloffset.z genhexkins.tool-offset) and",
-        "# spindle-offset. screw-lead stays 0, and base-n.*, platform-n.* unused: readings are",
-        "# taken to be lengths, without the turn of a screw that is not held.",
+        "# spindle-offset.",
+        *_screw_pins(source.machine, struts),
     ]
     return "\n".join(lines) + "\n"
 
@@ -384,7 +415,8 @@ def genhexkins(hal: str, pose: Array) -> Array:
 
     hal : HAL file that sets the pins.
     """
-    pins = {name: np.zeros((GENHEXKINS_STRUTS, 3)) for name in ("base", "platform")}
+    names = ("base", "platform", "base-n", "platform-n")
+    pins = {name: np.zeros((GENHEXKINS_STRUTS, 3)) for name in names}
     for name, strut, axis, value in _STRUT.findall(hal):
         pins[name][int(strut), "xyz".index(axis)] = float(value)
     # R = Rz(C) Ry(B) Rx(A)
@@ -397,7 +429,17 @@ def genhexkins(hal: str, pose: Array) -> Array:
     ]
     rot = np.array(rows).transpose(2, 0, 1)
     end = pins["platform"] @ rot.transpose(0, 2, 1) + pose[:, None, :3]
-    return np.linalg.norm(end - pins["base"], axis=-1)
+    strut = end - pins["base"]
+    length = np.linalg.norm(strut, axis=-1)
+    lead = _LEAD.search(hal)
+    if lead is None:
+        return length
+    # the base's axis across the strut, and the platform's normal to it, as unit vectors
+    u = strut / length[..., None]
+    second = np.cross(u, np.cross(pins["base-n"], u))
+    across = np.cross(pins["platform-n"] @ rot.transpose(0, 2, 1), u)
+    sine = dot(second, across) / np.sqrt(dot(second, second) * dot(across, across))
+    return length + float(lead[1]) * np.arcsin(sine) / (2 * np.pi)
 
 
 # Deltas

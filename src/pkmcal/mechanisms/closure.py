@@ -6,6 +6,9 @@ There are E rows, the lengths of the legs that close, then the axes' equations, 
     |B - A| - length   (arm x u, u)   u . dB    -u . dA - scale   of A, B, rod, scale
     (B - A) . w        (arm x w, w)   w . dB    -w . dA           of A, B, two axes
 
+A screw that the joints turn adds lead / (2 pi) phi to its leg's first row, which then depends on
+two axes as well (:func:`~pkmcal.mechanisms.joints.screw_rows`).
+
 (w of an axis on the platform rotates with the pose, which adds a term in omega.)
 
 A row depends on one leg only, so derivatives by readings and parameters are stored by row, with the
@@ -30,7 +33,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.batches import fresh, moments
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import by_pose
-from pkmcal.mechanisms.joints import angle_rows
+from pkmcal.mechanisms.joints import AngleRows, angle_rows, screw_rows
 from pkmcal.mechanisms.layout import CarrierGroup, LimbLayout
 
 
@@ -143,6 +146,8 @@ def rows_between(
         distance=distance,
         w=u[..., :0, :],
     )
+    if len(layout.screws):
+        rows = _with_screws(layout, theta, poses, line, platform, rows)
     if not layout.all_close:
         rows = rows._replace(
             value=rows.value[..., layout.closing],
@@ -156,6 +161,30 @@ def limb_lines(base: BaseEnds, platform: PlatformEnds) -> tuple[Array, Array]:
     """Vectors B - A (..., L, 3) and their lengths (..., L), m."""
     line = platform.b - base.a
     return line, np.sqrt(dot(line, line))
+
+
+def _with_screws(
+    layout: LimbLayout, theta: Array, poses: Array, line: Array, platform: PlatformEnds, rows: Rows
+) -> Rows:
+    """Rows of all legs' lengths with what screws add to them."""
+    leg = layout.screws.leg
+    turned = screw_growth(layout, theta, poses, line)
+    by_pose = _by_pose(platform.arm[..., leg, :], turned.by_line)
+    by_pose[..., :3] += turned.by_turn
+    rows.value[..., leg] += turned.value
+    rows.by_pose[..., leg, :] += by_pose
+    rows.by_internal[..., leg, :] += _by_internal(
+        turned.by_line, platform.by_internal[..., leg, :, :]
+    )
+    return rows
+
+
+def screw_growth(layout: LimbLayout, theta: Array, poses: Array, line: Array) -> AngleRows:
+    """Excess of a screw's reading over its rod's length, with derivatives.
+
+    line : (..., L, 3) B - A of all legs, m.
+    """
+    return screw_rows(layout.screws, theta, poses[..., :3, :3], line[..., layout.screws.leg, :])
 
 
 def _with_angles(
@@ -385,12 +414,21 @@ class Closure(LimbEnds):
 
     def _by_length(self) -> Array:
         """Derivatives of |B - A| - length, for the legs that close."""
-        layout, u = self.layout, self.rows.u
-        parts = (-along(u, self.a_by), along(u, self.b_by), np.full((1, 1), -1.0))
+        layout, slope, axes = self.layout, self.rows.u, ()
+        if len(layout.screws):
+            leg = layout.screws.leg
+            turned = screw_growth(layout, self.theta, self.poses, self.b - self.a)
+            slope = np.array(slope)
+            slope[..., leg, :] += turned.by_line
+            by_axes = np.zeros((*slope.shape[:-1], 6))
+            by_axes[..., leg, :3] = turned.by_base_axis
+            by_axes[..., leg, 3:] = turned.by_platform_axis
+            axes = (by_axes,)
+        parts = (-along(slope, self.a_by), along(slope, self.b_by), np.full((1, 1), -1.0))
         if layout.scales_move_rods:
             grown = np.where(layout.rod_reads, _leg_readings(layout, self.readings), 0.0)
             parts = (*parts, -grown[..., None])
-        by_theta = _side_by_side(parts)
+        by_theta = _side_by_side((*parts, *axes))
         return by_theta if layout.all_close else by_theta[..., layout.closing, :]
 
     def _by_angles(self) -> Array:

@@ -38,12 +38,21 @@ def _check_increasing(value: tuple[float, float]) -> tuple[float, float]:
 
 class ActuatedLength(Schema):
     """Rod with a reading, ``length: {actuated: true, offset: 0.0, range: [min, max]}``; length =
-    scale * reading + offset.
+    scale * reading + offset, less what a screw that is not held from rotating adds: its lead per
+    turn of the outer joint relative to the inner one.
     """
 
     actuated: Literal[True]
     offset: Metres = 0.0
     range: Annotated[tuple[Metres, Metres], AfterValidator(_check_increasing)] | None = None
+    lead: (
+        Annotated[
+            Metres,
+            Field(ge=-0.1, le=0.1, description="the lead of a screw that the joints turn, such as"
+                  " 5 mm, negative for a left-hand thread"),
+        ]
+        | None
+    ) = None  # fmt: skip
 
 
 class ConstantLength(Schema):

@@ -29,7 +29,7 @@ from pkmcal.mechanisms.document import (
     MechanismDocument,
     PassiveLength,
 )
-from pkmcal.mechanisms.joints import equations
+from pkmcal.mechanisms.joints import equations, screws
 from pkmcal.mechanisms.motors import bodies, motor_columns, sharing
 from pkmcal.wording import listed
 
@@ -51,6 +51,7 @@ def check_nominal(document: MechanismDocument, where: PlaceInDocument | None = N
             _check_plane(document, j, leg, place)
         if document.motion in ("translation", "planar-translation"):
             _check_parallel(j, leg, place)
+        _check_screw(document, j, leg, place)
         if base.driven and not isinstance(leg.length, ConstantLength):
             raise InputError(
                 f"leg {j + 1} is moved by its {leg.base.joint}, so its rod has one length",
@@ -70,6 +71,24 @@ def check_nominal(document: MechanismDocument, where: PlaceInDocument | None = N
         for field in fields:
             _check_equal(document, side, legs, field, place)
     _check_equations(document, place)
+
+
+def _check_screw(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDocument) -> None:
+    """Check that a screw which its joints turn has two axes on a machine that rotates."""
+    if j not in screws(document):
+        return
+    roles = (
+        base_carriers()[leg.base.joint].axis_role(leg.base),
+        platform_carriers()[leg.platform.joint].axis_role(leg.platform),
+    )
+    if document.motion != "spatial" or roles != ("twist", "twist"):
+        raise InputError(
+            f"leg {j + 1} has a screw's lead, but no two joints that turn the screw",
+            where=place("legs", j, "length", "lead"),
+            found=f"{leg.base.joint} and {leg.platform.joint}, motion: {document.motion}",
+            expected="motion: spatial, and joint: universal with axis: [x, y, z] at both ends",
+            next_step="Give both joints' axes, or leave out lead",
+        )
 
 
 def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDocument) -> None:

@@ -86,7 +86,7 @@ def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
     """Rods of a machine with values theta (P,); None if the fast path does not cover it."""
     legs = np.flatnonzero(layout.closing)
     square = layout.n_equations == layout.motion.shape[1]
-    if not square or len(layout.angles) or layout.n_internal:
+    if not square or not layout.rods_alone or layout.n_internal:
         return None
     base, platform = (_leg_chains(groups, theta) for groups in (layout.base, layout.platform))
     if base is None or platform is None:

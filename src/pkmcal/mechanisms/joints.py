@@ -12,12 +12,20 @@ revolute joint on the base has w = v, its unit axis; on the platform w = R v'. A
 twist has ``w = v x R v'``. Values are in metres, like the lengths in the same least-squares
 problem.
 
+A screw that the joints are free to turn has two universal joints with axes, too, but does not hold
+its rod from twisting: instead, the twist phi changes what the reading is, by lead / (2 pi) phi
+(LinuxCNC's genhexkins, ``screw-lead``). phi is the angle about the limb's direction u = d / |d|
+from the base's axis to the platform's, both seen along u. Axes are lines, so phi is modulo pi::
+
+    tan phi = s / c,   s = u . (v x R v'),   c = v . R v' - (v . u) (R v' . u)
+
 Planar and translational machines move as their file states, so axes add no equations.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -25,7 +33,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
-from pkmcal.mechanisms.document import MechanismDocument
+from pkmcal.mechanisms.document import ActuatedLength, MechanismDocument
 
 JOINT_AXIS_KINDS = tuple(ParameterKind(f"axis.{axis}", "1", "axis") for axis in "xyz")
 
@@ -44,19 +52,32 @@ def equations(document: MechanismDocument) -> tuple[tuple[int, Equation], ...]:
             out.append((j, "revolute base"))
         if platform == "square":
             out.append((j, "revolute platform"))
-        if base == platform == "twist":
+        if base == platform == "twist" and j not in screws(document):
             out.append((j, "torsion"))
     return tuple(out)
 
 
+def screws(document: MechanismDocument) -> dict[int, float]:
+    """Leads, m, of the screws that joints turn, by leg from 0."""
+    lengths = {j: leg.length for j, leg in enumerate(document.legs)}
+    return {
+        j: length.lead
+        for j, length in lengths.items()
+        if isinstance(length, ActuatedLength) and length.lead is not None
+    }
+
+
 def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:
-    """Ends (leg from 0, side) whose axis is in an equation and hence a parameter."""
+    """Ends (leg from 0, side) whose axis is in an equation or a screw's twist and hence a
+    parameter.
+    """
     sides: dict[Equation, tuple[str, ...]] = {
         "revolute base": ("base",),
         "revolute platform": ("platform",),
         "torsion": ("base", "platform"),
     }
-    return {(j, side) for j, which in equations(document) for side in sides[which]}
+    in_equations = {(j, side) for j, which in equations(document) for side in sides[which]}
+    return in_equations | {(j, side) for j in screws(document) for side in sides["torsion"]}
 
 
 @dataclass(frozen=True)
@@ -78,9 +99,32 @@ class AngleLayout:
         return len(self.leg)
 
 
+@dataclass(frozen=True)
+class ScrewLayout:
+    """Screws (S of them) that joints turn.
+
+    leg : (S,). lead : (S,) m per turn, positive for a right-hand thread.
+    base, platform : (S, 3) indices of the axes' parameters.
+    """
+
+    leg: Integers
+    lead: Array
+    base: Integers
+    platform: Integers
+
+    def __len__(self) -> int:
+        return len(self.leg)
+
+    @cached_property
+    def axes(self) -> Integers:
+        """Indices (S, 6) of the parameters of both axes."""
+        return np.concatenate([self.base, self.platform], axis=1)
+
+
 class AngleRows(NamedTuple):
-    """Angle equations: values (..., E), m, and derivatives (..., E, 3) by the limb's line, by the
-    platform's rotation, and by the parameters of the base and platform axes.
+    """Angle equations, or changes of screws' readings: values (..., E), m, and derivatives
+    (..., E, 3) by the limb's line, by the platform's rotation, and by the parameters of the base
+    and platform axes.
     """
 
     value: Array
@@ -106,6 +150,53 @@ def angle_layout(document: MechanismDocument, base: Integers, platform: Integers
         np.where(on_platform[:, None], platform[leg], 0),
         on_base,
         on_platform,
+    )
+
+
+def screw_layout(document: MechanismDocument, base: Integers, platform: Integers) -> ScrewLayout:
+    """Screws of a document.
+
+    base, platform : (L, 3) indices of the axes' parameters.
+    """
+    leads = screws(document)
+    leg = np.array(list(leads), dtype=int)
+    return ScrewLayout(leg, np.array(list(leads.values())), base[leg], platform[leg])
+
+
+def screw_turns(layout: ScrewLayout, theta: Array, rot: Array, line: Array) -> Array:
+    """Turns phi (..., S), rad, of screws by their joints; arguments as of :func:`screw_rows`."""
+    return screw_rows(replace(layout, lead=np.full(len(layout), 2 * np.pi)), theta, rot, line).value
+
+
+def screw_rows(layout: ScrewLayout, theta: Array, rot: Array, line: Array) -> AngleRows:
+    """Changes of screws' readings, lead / (2 pi) phi; see the module's docstring.
+
+    theta : (..., P).
+    rot : (..., 3, 3) rotation of the platform.
+    line : (..., S, 3) B - A of each screw's leg, m.
+    """
+    every = np.ones((len(layout), 1), dtype=bool)
+    v, v_size = _unit(theta[..., layout.base], every)
+    own, own_size = _unit(theta[..., layout.platform], every)
+    w = (rot[..., None, :, :] @ own[..., None])[..., 0]
+    distance = np.sqrt(dot(line, line))[..., None]
+    u = line / distance
+    along_v, along_w = dot(u, v)[..., None], dot(u, w)[..., None]
+    normal = cross(v, w)
+    s, c = dot(u, normal)[..., None], dot(v, w)[..., None] - along_v * along_w
+    # d phi = (c ds - s dc) / (s^2 + c^2), times the growth per radian
+    growth = layout.lead[:, None] / (2 * np.pi)
+    by_s, by_c = growth * c / (s * s + c * c), -growth * s / (s * s + c * c)
+    by_v = by_s * cross(w, u) + by_c * (w - along_w * u)
+    by_w = by_s * cross(u, v) + by_c * (v - along_v * u)
+    by_u = by_s * normal - by_c * (along_w * v + along_v * w)
+    by_own = (rot.mT[..., None, :, :] @ by_w[..., None])[..., 0]
+    return AngleRows(
+        value=(growth * np.arctan(s / c))[..., 0],
+        by_line=_across(by_u, u) / distance,
+        by_turn=cross(w, by_w),
+        by_base_axis=_across(by_v, v) / v_size,
+        by_platform_axis=_across(by_own, own) / own_size,
     )
 
 

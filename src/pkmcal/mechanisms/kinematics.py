@@ -38,6 +38,7 @@ from pkmcal.mechanisms.closure import (
     rod_lengths,
     rows_between,
     scales,
+    screw_growth,
 )
 from pkmcal.mechanisms.layout import LimbLayout
 
@@ -333,7 +334,10 @@ def _leg_readings(
     """
     at_zero = base_ends(layout, theta, np.zeros(layout.n_readings))
     platform = platform_ends(layout, theta, poses, internal)
-    distance = limb_lines(at_zero, platform)[1]
+    line, distance = limb_lines(at_zero, platform)
+    if len(layout.screws):
+        distance = np.array(distance)
+        distance[..., layout.screws.leg] += screw_growth(layout, theta, poses, line).value
     # A rod on a fixed centre is linear in its reading.
     out, scale = np.where(layout.rod_reads, distance - at_zero.length, 0.0), scales(layout, theta)
     for group in layout.base:

@@ -16,7 +16,13 @@ from pkmcal.mechanisms.document import (
     MechanismDocument,
     PassiveLength,
 )
-from pkmcal.mechanisms.joints import JOINT_AXIS_KINDS, AngleLayout, angle_layout
+from pkmcal.mechanisms.joints import (
+    JOINT_AXIS_KINDS,
+    AngleLayout,
+    ScrewLayout,
+    angle_layout,
+    screw_layout,
+)
 from pkmcal.mechanisms.motors import bodies, middles, motor_columns
 
 
@@ -65,6 +71,7 @@ class LimbLayout:
     base_axis, platform_axis : (L, 3) indices of the axes' parameters, -1 for an axis that is not a
         parameter.
     angles : the axes' equations.
+    screws : the screws that joints turn.
     turning : indices (n, 3) of all direction vectors among the parameters, in the base frame and in
         the platform frame.
     radius : (tubes,) indices of the radii, for each leg.
@@ -86,6 +93,7 @@ class LimbLayout:
     base_axis: Integers
     platform_axis: Integers
     angles: AngleLayout
+    screws: ScrewLayout
     turning: tuple[Integers, Integers]
     radius: tuple[Integers, ...]
     motion: Array
@@ -146,6 +154,11 @@ class LimbLayout:
         """
         lengths = np.all(self.row_is_rod | (self.row_motor < 0))
         return bool(lengths) and not self.shares_motors
+
+    @cached_property
+    def rods_alone(self) -> bool:
+        """Whether distances of joint centres are all of the closure: no axis is in it."""
+        return not len(self.angles) and not len(self.screws)
 
     @cached_property
     def own_motion(self) -> Array:
@@ -222,7 +235,11 @@ class LimbLayout:
         parts = [self.a_index, self.b_index, rod]
         if self.scales_move_rods:
             parts.append(np.where(self.rod_reads, self.scale, none)[:, None])
-        # Rows of lengths: A, B, rod and the rod's scale.
+        if len(self.screws):
+            turned = np.full((self.n_legs, 6), none)
+            turned[self.screws.leg] = self.screws.axes
+            parts.append(turned)
+        # Rows of lengths: A, B, rod, the rod's scale, and the axes that turn a screw.
         lengths = np.concatenate(parts, axis=1)[keep]
         # Rows of axes: A, B and the two axes.
         angles = np.concatenate(
@@ -298,6 +315,7 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         base_axis=base_axis,
         platform_axis=platform_axis,
         angles=angle_layout(document, base_axis, platform_axis),
+        screws=screw_layout(document, base_axis, platform_axis),
         turning=(
             _direction_index(document, "base", positions),
             _direction_index(document, "platform", positions),

@@ -142,6 +142,11 @@ class Machine:
         """Copy with other parameter values (P,)."""
         return replace(self, values=np.array(values, dtype=float))
 
+    def with_screws_held(self) -> Machine:
+        """Copy with the same parameters whose readings are lengths: no joint turns a screw."""
+        screws = replace(self.layout.screws, lead=np.zeros(len(self.layout.screws)))
+        return replace(self, layout=replace(self.layout, screws=screws))
+
     @cached_property
     def size(self) -> float:
         """Largest of the lengths, coordinates and ranges of readings, m."""

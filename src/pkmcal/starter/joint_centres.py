@@ -3,6 +3,7 @@ genhexkins, or a CSV table.
 
 genhexkins (LinuxCNC's src/emc/kinematics): joint N is the length from ``base.N``, in the base
 frame, to ``platform.N``, in the platform frame; pins have the unit of the INI file's LINEAR_UNITS.
+``screw-lead`` adds lead / (2 pi) times the turn between the axes ``base-n.N`` and ``platform-n.N``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pkmcal.errors import InputError, legible
 from pkmcal.files import MOST_MACHINE_LEGS, check_count, quoted, read_text
 from pkmcal.files.quantities import LARGEST_UNITLESS_LENGTH, split_head
 from pkmcal.starter.families import DIMENSIONS
-from pkmcal.starter.nominal import NominalLeg, NominalModel, millimetres, option_of
+from pkmcal.starter.nominal import NominalLeg, NominalModel, Screw, millimetres, option_of
 from pkmcal.wording import listed
 
 UNITS: Mapping[str, float] = {"mm": 1e-3, "inch": 0.0254}
@@ -57,9 +58,9 @@ def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> N
             found=listed([option_of(name) for name in given]) or "no --leg",
             expected="--leg LENGTH, and where known --travel and --tube-radius",
         )
-    remarks: tuple[str, ...] = ()
+    screws: tuple[Screw, ...] | None = None
     if of_hal:
-        base, platform, remarks = _of_hal(text, path.name, unit)
+        base, platform, screws = _of_hal(text, path.name, unit)
     else:
         if unit is not None:
             raise InputError(
@@ -90,8 +91,8 @@ def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> N
         "hexapod",
         (
             f"A hexapod by the joint centres in {legible(path.name)}: legs of variable length, in"
-            " that file's order. A reading is the leg's length.",
-            *remarks,
+            " that file's order. A reading is the leg's length"
+            + (", with what a screw adds that its joints turn." if screws else "."),
         ),
         tuple(
             (f"{name}: {millimetres(given[name])}", *DIMENSIONS[name])
@@ -99,7 +100,10 @@ def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> N
             if name in given
         ),
         "spatial",
-        tuple(NominalLeg.telescope(a, b, sweep) for a, b in zip(base, platform, strict=True)),
+        tuple(
+            NominalLeg.telescope(a, b, sweep, screw)
+            for a, b, screw in zip(base, platform, screws or [None] * len(base), strict=True)
+        ),
         home,
         given.get("tube_radius"),
     )
@@ -123,8 +127,10 @@ def _home(base: Array, platform: Array, leg: float) -> Array:
     return np.array([*-gap[:, :2].mean(axis=0), np.sqrt(rest) - gap[:, 2].mean()])
 
 
-def _of_hal(text: str, label: str, unit: str | None) -> tuple[Array, Array, tuple[str, ...]]:
-    """Centres (6, 3) of base and platform, m, and remarks, of pins of genhexkins."""
+def _of_hal(
+    text: str, label: str, unit: str | None
+) -> tuple[Array, Array, tuple[Screw, ...] | None]:
+    """Centres (6, 3) of base and platform, m, and the struts' screws, of pins of genhexkins."""
     if unit not in UNITS:
         raise InputError(
             f"{label} does not name the unit of its values",
@@ -135,29 +141,37 @@ def _of_hal(text: str, label: str, unit: str | None) -> tuple[Array, Array, tupl
             ),
         )
     pins = {name: (value, m) for m in _PIN.finditer(text) for name, value in [m.groups()]}
-    values = np.empty((2, STRUTS, 3))
-    for (e, end), strut, (k, axis) in product(
-        enumerate(("base", "platform")), range(STRUTS), enumerate("xyz")
-    ):
-        name = f"{end}.{strut}.{axis}"
+
+    def pin(name: str, what: str) -> float:
         if name not in pins:
             raise InputError(
-                "a joint centre is incomplete",
+                f"{what} is incomplete",
                 where=label,
                 found=f"no genhexkins.{name}",
                 expected=f"setp genhexkins.{name} VALUE",
             )
         value, match = pins[name]
         line = text.count("\n", 0, match.start(1)) + 1
-        values[e, strut, k] = _number(value, f"{label}, line {line}, genhexkins.{name}")
-    remarks = ()
-    lead = pins.get("screw-lead", ("0", None))[0]
-    if lead.strip("+-0.") != "":
-        remarks = (
-            f"genhexkins.screw-lead is {legible(lead)}: how far a strut grows as its joints turn it"
-            " is not part of this model.",
+        return _number(value, f"{label}, line {line}, genhexkins.{name}")
+
+    def vectors(group: str, what: str) -> Array:
+        names = ([f"{group}.{strut}.{axis}" for axis in "xyz"] for strut in range(STRUTS))
+        return np.array([[pin(name, what) for name in row] for row in names])
+
+    base, platform = (UNITS[unit] * vectors(x, "a joint centre") for x in ("base", "platform"))
+    lead = pin("screw-lead", "a screw") if "screw-lead" in pins else 0.0
+    if lead == 0:
+        return base, platform, None
+    axes = np.stack([vectors(f"{end}-n", "a screw's axis") for end in ("base", "platform")], axis=1)
+    size = np.linalg.norm(axes, axis=-1, keepdims=True)
+    if not size.all():
+        raise InputError(
+            "a joint's axis has no direction",
+            where=label,
+            found="0, 0, 0",
+            expected="genhexkins.base-n.N and genhexkins.platform-n.N as unit vectors",
         )
-    return values[0] * UNITS[unit], values[1] * UNITS[unit], remarks
+    return base, platform, tuple(Screw(lead * UNITS[unit], *pair) for pair in axes / size)
 
 
 def _of_table(text: str, label: str) -> tuple[Array, Array]:

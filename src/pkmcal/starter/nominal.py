@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,12 +32,23 @@ def option_of(number: str) -> str:
     return f"--{number.replace('_', '-')}"
 
 
+class Screw(NamedTuple):
+    """Screw that its universal joints turn: lead, m, and the joints' axes (3,), unit vectors in
+    base and platform frame.
+    """
+
+    lead: float
+    base_axis: Array
+    platform_axis: Array
+
+
 @dataclass(frozen=True)
 class NominalLeg:
     """Leg of a nominal model, m.
 
     base, rod : their entries in the file. start : A (3,) at home, base frame. platform : B (3,),
-    platform frame. least : shortest length; None for that at home.
+    platform frame. least : shortest length; None for that at home. axis : (3,) of its universal
+    joint on the platform; None for a spherical one.
     """
 
     base: str
@@ -44,21 +56,28 @@ class NominalLeg:
     start: Array
     platform: Array
     least: float | None = None
+    axis: Array | None = None
 
     __repr__ = short_repr
 
     @classmethod
     def telescope(
-        cls, base: Array, platform: Array, sweep: tuple[float, float] | None
+        cls,
+        base: Array,
+        platform: Array,
+        sweep: tuple[float, float] | None,
+        screw: Screw | None = None,
     ) -> NominalLeg:
         """Leg of variable length; sweep : its shortest and longest length."""
         ends = "" if sweep is None else f", range: {_numbers(sweep)}"
+        ends += "" if screw is None else f", lead: {millimetres(screw.lead)}"
         return cls(
-            f"{{joint: spherical, center: {_numbers(base)}}}",
+            _joint(base, None if screw is None else screw.base_axis),
             f"{{actuated: true, offset: 0{ends}}}",
             base,
             platform,
             None if sweep is None else sweep[0],
+            None if screw is None else screw.platform_axis,
         )
 
     @classmethod
@@ -161,7 +180,7 @@ class NominalModel:
 
     def _leg_text(self, leg: NominalLeg) -> str:
         """Entry of a leg."""
-        platform = f"{{joint: spherical, center: {_numbers(leg.platform)}}}"
+        platform = _joint(leg.platform, leg.axis)
         text = f"  - base: {leg.base}\n    platform: {platform}\n    length: {leg.rod}\n"
         if self.tube_radius is None:
             return text
@@ -176,6 +195,13 @@ class NominalModel:
 def _numbers(values: Array | tuple[float, ...]) -> str:
     """Lengths as a list."""
     return f"[{', '.join(millimetres(value) for value in values)}]"
+
+
+def _joint(center: Array, axis: Array | None) -> str:
+    """Entry of a spherical joint, or of a universal joint with its axis."""
+    if axis is None:
+        return f"{{joint: spherical, center: {_numbers(center)}}}"
+    return f"{{joint: universal, center: {_numbers(center)}, axis: {_direction(axis)}}}"
 
 
 def _direction(vector: Array) -> str:

@@ -7,8 +7,9 @@
  * pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.
  * twist: omega_x, omega_y, omega_z (rad/s), tau_x, tau_y, tau_z (m/s): R changes by omega x R, t
  * by tau, both along the base frame's axes.
- * length of a rod = scale * reading + offset; a slide's way and a crank's turn are scale *
- * reading. Readings in the order of the machine's columns.
+ * length of a rod = scale * reading + offset, less what a screw adds that the joints turn; a
+ * slide's way and a crank's turn are scale * reading. Readings in the order of the machine's
+ * columns.
  * C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all
  * functions can run at once in several threads. Do not compile with -ffast-math.
  *
@@ -98,7 +99,8 @@ enum { CONSTANT, TELESCOPE, SLIDE, TURN };
  * moved, and phi the turn of the bar that it ends on, if it ends on one:
  *   a = base, base + q rate (SLIDE), or base + cos(q) arm + sin(q) rate (TURN), base frame;
  *   b = t + R (platform + cos(phi) swing + sin(phi) swing_rate) + floating;
- *   |b - a| = length, or length + q (TELESCOPE).
+ *   |b - a| = length, or length + q - growth phi (TELESCOPE), with phi the turn about the rod from
+ *   the base's axis to the platform's, modulo pi: what a screw adds that the joints turn.
  * What a rod has not is zero. */
 typedef struct {
     int drive;
@@ -115,6 +117,9 @@ typedef struct {
     pkmcal_real swing[3];      /* m, platform frame: from the foot to the end at phi = 0 */
     pkmcal_real swing_rate[3]; /* m/rad */
     pkmcal_real floating[3];   /* m, base frame: on a bar that keeps its direction */
+    pkmcal_real growth;        /* m/rad, of a screw that the joints turn: lead / (2 pi) */
+    pkmcal_real base_axis[3];  /* unit, base frame: the joint's axis; of a screw */
+    pkmcal_real platform_axis[3]; /* unit, platform frame */
 } rod_data;
 
 /* An equation of a joint's axis: the rod has no part along w, which is the base's axis, the
@@ -156,6 +161,9 @@ static const rod_data RODS[PKMCAL_RODS] = {
         {0, 0, 0}, /* swing */
         {0, 0, 0}, /* swing_rate */
         {0, 0, 0}, /* floating */
+        0, /* growth */
+        {0, 0, 0}, /* base_axis */
+        {0, 0, 0}, /* platform_axis */
     },
     /* leg 2 of the mechanism file */
     {
@@ -173,6 +181,9 @@ static const rod_data RODS[PKMCAL_RODS] = {
         {0, 0, 0}, /* swing */
         {0, 0, 0}, /* swing_rate */
         {0, 0, 0}, /* floating */
+        0, /* growth */
+        {0, 0, 0}, /* base_axis */
+        {0, 0, 0}, /* platform_axis */
     },
     /* leg 3 of the mechanism file */
     {
@@ -190,6 +201,9 @@ static const rod_data RODS[PKMCAL_RODS] = {
         {0, 0, 0}, /* swing */
         {0, 0, 0}, /* swing_rate */
         {0, 0, 0}, /* floating */
+        0, /* growth */
+        {0, 0, 0}, /* base_axis */
+        {0, 0, 0}, /* platform_axis */
     },
     /* leg 4 of the mechanism file */
     {
@@ -207,6 +221,9 @@ static const rod_data RODS[PKMCAL_RODS] = {
         {0, 0, 0}, /* swing */
         {0, 0, 0}, /* swing_rate */
         {0, 0, 0}, /* floating */
+        0, /* growth */
+        {0, 0, 0}, /* base_axis */
+        {0, 0, 0}, /* platform_axis */
     },
     /* leg 5 of the mechanism file */
     {
@@ -224,6 +241,9 @@ static const rod_data RODS[PKMCAL_RODS] = {
         {0, 0, 0}, /* swing */
         {0, 0, 0}, /* swing_rate */
         {0, 0, 0}, /* floating */
+        0, /* growth */
+        {0, 0, 0}, /* base_axis */
+        {0, 0, 0}, /* platform_axis */
     },
     /* leg 6 of the mechanism file */
     {
@@ -241,6 +261,9 @@ static const rod_data RODS[PKMCAL_RODS] = {
         {0, 0, 0}, /* swing */
         {0, 0, 0}, /* swing_rate */
         {0, 0, 0}, /* floating */
+        0, /* growth */
+        {0, 0, 0}, /* base_axis */
+        {0, 0, 0}, /* platform_axis */
     },
 };
 
@@ -418,6 +441,39 @@ static void platform_end(const rod_data *rod, const state *at, pkmcal_real arm[3
     }
 }
 
+/* What a screw that the joints turn adds to the reading, m, for a rod of a size and direction w.
+ * Adds its derivative by the rod's end to w, and by the platform's turn about that end to more. */
+static pkmcal_real screw_growth(const rod_data *rod, const state *at, pkmcal_real size,
+                                pkmcal_real w[3], pkmcal_real more[3])
+{
+    const pkmcal_real *v = rod->base_axis;
+    const pkmcal_real u[3] = {w[0], w[1], w[2]};
+    pkmcal_real n[3], normal[3], by_n[3], by_u[3], s, c, by_s, by_c, along_v, along_n, along_u;
+    int i;
+    if (rod->growth == 0) {
+        return 0;
+    }
+    turned(&at->pose, rod->platform_axis, n);
+    cross(v, n, normal);
+    cross(u, v, by_n);
+    along_v = dot(u, v);
+    along_n = dot(u, n);
+    s = dot(u, normal);
+    c = dot(v, n) - along_v * along_n;
+    by_s = rod->growth * c / (s * s + c * c);
+    by_c = -rod->growth * s / (s * s + c * c);
+    for (i = 0; i < 3; ++i) {
+        by_n[i] = by_s * by_n[i] + by_c * (v[i] - along_v * u[i]);
+        by_u[i] = by_s * normal[i] - by_c * (along_n * v[i] + along_v * n[i]);
+    }
+    along_u = dot(by_u, u);
+    for (i = 0; i < 3; ++i) {
+        w[i] += (by_u[i] - along_u * u[i]) / size;
+    }
+    cross(n, by_n, more);
+    return rod->growth * MATH(atan)(s / c);
+}
+
 /* How fast the rod's end on the platform goes along u with the turn of its bar, m/rad. */
 static pkmcal_real hinge_gain(const rod_data *rod, const state *at, const pkmcal_real u[3])
 {
@@ -519,7 +575,7 @@ static pkmcal_status own_readings(const state *at, pkmcal_real joints[PKMCAL_JOI
     }
     for (k = 0; k < PKMCAL_RODS; ++k) {
         const rod_data *rod = &RODS[k];
-        pkmcal_real arm[3], b[3], reading = 0;
+        pkmcal_real arm[3], b[3], u[3], more[3], reading = 0, size;
         if (rod->drive == CONSTANT) {
             continue;
         }
@@ -527,7 +583,8 @@ static pkmcal_status own_readings(const state *at, pkmcal_real joints[PKMCAL_JOI
         if (rod_reading(rod, b, &reading) != PKMCAL_OK) {
             return PKMCAL_OUT_OF_REACH;
         }
-        joints[rod->joint] += reading;
+        size = direction(rod->base, b, u);
+        joints[rod->joint] += reading + screw_growth(rod, at, size, u, more) / rod->scale;
         ++count[rod->joint];
     }
     for (k = 0; k < PKMCAL_JOINTS; ++k) {
@@ -550,10 +607,11 @@ static void normal_equations(const pkmcal_real joints[PKMCAL_JOINTS], const stat
     }
     for (k = 0; k < PKMCAL_RODS; ++k) {
         const rod_data *rod = &RODS[k];
-        pkmcal_real a[3], b[3], u[3], arm[3], row[INVERSE_UNKNOWNS] = {0}, value;
+        pkmcal_real a[3], b[3], u[3], arm[3], more[3], row[INVERSE_UNKNOWNS] = {0}, value;
         base_end(rod, joints, a);
         platform_end(rod, at, arm, b);
-        value = direction(a, b, u) - rod_length(rod, joints);
+        value = direction(a, b, u);
+        value += screw_growth(rod, at, value, u, more) - rod_length(rod, joints);
         if (rod->drive != CONSTANT) {
             row[rod->joint] = -reading_gain(rod, joints, u);
         }
@@ -629,7 +687,7 @@ pkmcal_status pkmcal_inverse_jacobian(const pkmcal_pose *pose,
     at.pose = *pose;
     for (k = 0; k < PKMCAL_RODS; ++k) {
         const rod_data *rod = &RODS[k];
-        pkmcal_real a[3], b[3], u[3], arm[3], moment[3], size, gain;
+        pkmcal_real a[3], b[3], u[3], arm[3], moment[3], more[3] = {0, 0, 0}, size, gain;
         if (rod->drive == CONSTANT) {
             continue;
         }
@@ -637,12 +695,13 @@ pkmcal_status pkmcal_inverse_jacobian(const pkmcal_pose *pose,
         platform_end(rod, &at, arm, b);
         size = direction(a, b, u);
         gain = reading_gain(rod, joints, u);
+        screw_growth(rod, &at, size, u, more);
         if (!(size > 0) || MATH(fabs)(gain) < HALF_DIGITS) {
             return PKMCAL_SINGULAR; /* the twist tells the rate of no reading */
         }
         cross(arm, u, moment);
         for (i = 0; i < 3; ++i) {
-            jacobian[rod->joint][i] = moment[i] / gain;
+            jacobian[rod->joint][i] = (moment[i] + more[i]) / gain;
             jacobian[rod->joint][3 + i] = u[i] / gain;
         }
     }
@@ -709,10 +768,14 @@ static pkmcal_real closure(const anchors *base, const state *at, pkmcal_real val
     pkmcal_real arm[PKMCAL_RODS][3], b[PKMCAL_RODS][3], cost = 0;
     int i, k;
     for (k = 0; k < PKMCAL_RODS; ++k) {
-        pkmcal_real u[3], moment[3];
+        pkmcal_real u[3], moment[3], more[3] = {0, 0, 0};
         platform_end(&RODS[k], at, arm[k], b[k]);
-        value[k] = direction(base->a[k], b[k], u) - base->length[k];
+        value[k] = direction(base->a[k], b[k], u);
+        value[k] += screw_growth(&RODS[k], at, value[k], u, more) - base->length[k];
         cross(arm[k], u, moment);
+        for (i = 0; i < 3; ++i) {
+            moment[i] += more[i];
+        }
         set_row(moment, u, rows[k]);
         if (HINGES > 0 && RODS[k].hinge > 0) {
             rows[k][FREEDOMS + RODS[k].hinge - 1] = hinge_gain(&RODS[k], at, u);

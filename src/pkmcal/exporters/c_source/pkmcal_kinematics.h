@@ -7,8 +7,9 @@
  * pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.
  * twist: omega_x, omega_y, omega_z (rad/s), tau_x, tau_y, tau_z (m/s): R changes by omega x R, t
  * by tau, both along the base frame's axes.
- * length of a rod = scale * reading + offset; a slide's way and a crank's turn are scale *
- * reading. Readings in the order of the machine's columns.
+ * length of a rod = scale * reading + offset, less what a screw adds that the joints turn; a
+ * slide's way and a crank's turn are scale * reading. Readings in the order of the machine's
+ * columns.
  * C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all
  * functions can run at once in several threads. Do not compile with -ffast-math.
  */
