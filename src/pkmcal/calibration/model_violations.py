@@ -431,6 +431,48 @@ def _screw_leads(
     yield Column("machine.screw_lead", "screws", "screw lead", readings=by, facts=facts)
 
 
+def _joint_offsets(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Universal joints whose two axes do not meet, by the axes' distance e.
+
+    The second axis then lies e towards the other end, square to the first axis v. With the angle
+    beta of the leg out of the plane square to v, the leg's length is |B - A| - e cos(beta), to
+    terms in (e sin(beta))^2 / 2 |B - A|.
+    """
+    del session, observation
+    machine, used = estimate.machine, estimate.configurations
+    layout, joints = machine.layout, measured.joints[estimate.configurations]
+    poses = estimate.state.T_base_platform[used]
+    ends = limb_ends(layout, machine.values, joints, poses)
+    line = ends.b - ends.a
+    u = line / np.linalg.norm(line, axis=-1, keepdims=True)
+    scale = scales_of(layout, machine.values)
+    for j, leg in enumerate(machine.document.legs):
+        for node, side, to_base in (
+            (leg.base, "base", np.eye(3)),
+            (leg.platform, "platform", poses[:, :3, :3]),
+        ):
+            axis = getattr(node, "axis", None)
+            if node.joint != "universal" or axis is None or not layout.rod_reads[j]:
+                continue
+            v = to_base @ (np.array(axis) / np.linalg.norm(axis))
+            across = np.sqrt(1 - np.sum(u[:, j] * v, axis=-1) ** 2)
+            by = np.zeros((*measured.joints.shape, 1))
+            by[used, layout.actuated[j], 0] = across / scale[j]
+
+            def facts(value: Array, sigma: Array, side: str = side) -> dict[str, Any]:
+                return {"value": value[0], "sigma": sigma[0], "side": side}
+
+            yield Column(
+                "machine.joint_offset",
+                f"leg {j + 1}",
+                f"offset of {side} joint's axes",
+                readings=by,
+                facts=facts,
+            )
+
+
 def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
     """Facts about a lean by two angles (2,), rad."""
     size = float(np.linalg.norm(value))
@@ -439,7 +481,7 @@ def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
 
 
 TESTED = (
-    _reading_scales, _reading_plays, _leaning_towers, _screw_leads, _lenses, _lenses_of_stations,
-    _boards, _tripods,
+    _reading_scales, _reading_plays, _leaning_towers, _screw_leads, _joint_offsets, _lenses,
+    _lenses_of_stations, _boards, _tripods,
 )  # fmt: skip
 """What a session takes for granted and that may be otherwise; each is a family of columns."""
