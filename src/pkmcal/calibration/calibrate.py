@@ -57,6 +57,7 @@ from pkmcal.calibration.refinement import (
 )
 from pkmcal.calibration.rejections import rejection_findings, unused_configurations
 from pkmcal.calibration.summary import CalibrationSummary, Overview
+from pkmcal.calibration.thermal_growth import growth_notes
 from pkmcal.calibration.tube_radii import explain_radii
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import closest, quoted, resolved
@@ -599,6 +600,7 @@ def _findings_of_estimate(
     yield from noise_notes(session, estimate, named, explained=uneven_bed)
     yield from lens_notes(turns.cameras)
     yield from size_notes(session, measurements, estimate)
+    yield from growth_notes(session, estimate)
     yield from scale_notes(session, estimate, tuple(one.of for one in detections))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.views import Boards
+from pkmcal.calibration.thermal_growth import thermal_effects
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import Estimate
@@ -224,6 +225,7 @@ def measurements_of(
         poses=concatenate(sets),
         mounts=tuple(mounts),
         links=tuple(links),
+        effects=thermal_effects(session),
         level=np.array(
             [False] * len(session.stations) + [table.level for table in session.trackers],
             dtype=bool,

@@ -54,7 +54,7 @@ from pkmcal.outcome.finding import Finding, Level, doubtful, note
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
 from pkmcal.session.image_files import Image, find_images, image_header, label_of
 from pkmcal.session.poses import PoseTable, read_poses
-from pkmcal.session.readings import check_readings, without_repeats
+from pkmcal.session.readings import check_readings, without_repeats, without_temperature
 from pkmcal.session.schema import (
     BoardBody,
     SessionDocument,
@@ -139,6 +139,7 @@ class Session:
     workspace : region in which the tool must be accurate; None if not stated.
     rejected : stations that were removed because their images do not determine their poses.
     links : measurements that depend on two configurations, by kind.
+    temperature : (K,) °C or K, of the configurations; None where joints.csv has none.
     """
 
     folder: Path
@@ -157,6 +158,7 @@ class Session:
     workspace: Region | None = None
     rejected: tuple[RejectedStation, ...] = ()
     links: tuple[LinkSet, ...] = ()
+    temperature: Array | None = None
 
     def __repr__(self) -> str:
         parts = (
@@ -286,7 +288,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model)
     # Joint readings.
-    table, findings = _readings(folder, document, schema, machine, measured)
+    table, temperature, findings = _readings(folder, document, schema, machine, measured)
     # Board, camera stations and trackers.
     board = _board(folder, document, schema)
     findings += _unused_board(document, schema)
@@ -313,10 +315,11 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         machine=machine,
         configurations=table.names,
         joints=table.values,
+        temperature=temperature,
         joint_noise=schema.joints.noise,
         stations=stations,
         board=board,
-        document=_resolved_document(folder, schema, table, stations),
+        document=_resolved_document(folder, schema, table, temperature, stations),
         findings=tuple(findings),
         board_body=schema.board.fixed_to if schema.board else "platform",
         trackers=trackers,
@@ -346,13 +349,16 @@ def load_session_to_plan(folder: Path | str) -> Session:
 
 def _readings(
     folder: Path, document: Document, schema: SessionDocument, machine: Machine, measured: bool
-) -> tuple[CsvTable, list[Finding]]:
-    """Table of the joint readings, and findings on them; empty where none exist before a plan."""
+) -> tuple[CsvTable, Array | None, list[Finding]]:
+    """Table of the joint readings, temperatures (K,) where it has them, and findings on them; empty
+    where none exist before a plan.
+    """
     if not measured and not (folder / schema.joints.file).exists():
         none = np.zeros((0, machine.n_joints))
-        return CsvTable(schema.joints.file, machine.joint_names, (), none, ()), []
+        return CsvTable(schema.joints.file, machine.joint_names, (), none, ()), None, []
     path = _regular_file(folder, document, schema.joints.file, ("joints", "file"))
-    table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
+    whole, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
+    table, temperature = without_temperature(whole)
     written = written_unit(document.data["joints"]["noise"])
     if written and written.kind not in machine.joint_units:
         raise InputError(
@@ -362,9 +368,10 @@ def _readings(
     findings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
     if measured and not schema.stations and not schema.links():
         _check_redundant(document, machine)
-        table, repeated = without_repeats(table, noise)
+        whole, repeated = without_repeats(whole, table, noise)
+        table, temperature = without_temperature(whole)
         findings += repeated
-    return table, findings
+    return table, temperature, findings
 
 
 def _trackers(
@@ -798,7 +805,11 @@ def _unmeasured(
 
 
 def _resolved_document(
-    folder: Path, schema: SessionDocument, table: CsvTable, stations: tuple[Station, ...]
+    folder: Path,
+    schema: SessionDocument,
+    table: CsvTable,
+    temperature: Array | None,
+    stations: tuple[Station, ...],
 ) -> dict[str, Any]:
     """Content of session.yaml as plain data, with columns, readings and image files written out."""
     document = schema.model_dump(mode="json")
@@ -807,6 +818,8 @@ def _resolved_document(
             del document[kind.key]
     document["joints"]["columns"] = list(table.columns)
     document["joints"]["readings"] = dict(zip(table.names, table.values.tolist(), strict=True))
+    if temperature is not None:
+        document["joints"]["temperatures"] = temperature.tolist()
     for station in stations:
         entry = document["stations"][station.entry]
         entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe

@@ -41,6 +41,20 @@ _UNITS = {
 """By SI unit: name of the likely wrong unit, that of the right one, and the remedy."""
 
 
+TEMPERATURE_HEAD = re.compile(r"temperature(?: ?[\[(](?:°C|degC|C|K)[\])])?")
+"""Head of the column of temperatures."""
+
+
+def without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
+    """Table of the readings alone, and the temperatures (K,) of its last column, if it has one."""
+    if not table.columns or not TEMPERATURE_HEAD.fullmatch(table.columns[-1]):
+        return table, None
+    readings = replace(
+        table, columns=table.columns[:-1], values=table.values[:, :-1], units=table.units[:-1]
+    )
+    return readings, table.values[:, -1]
+
+
 def check_readings(
     table: CsvTable, ranges: Array, noise: float, units: Sequence[str]
 ) -> list[Finding]:
@@ -284,8 +298,12 @@ def same_pose(joints: Array, noise: float) -> Integers:
     return owner
 
 
-def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Finding]]:
+def without_repeats(
+    table: CsvTable, readings: CsvTable, noise: float
+) -> tuple[CsvTable, list[Finding]]:
     """Table with the rows of one pose replaced by their mean, and a warning about them.
+
+    readings : the table without its temperatures, of which poses are.
 
     Used for self-calibration from readings alone. Model errors, such as a belt that sags or a hook
     that is no point, are the same in all repeats of a pose; counted as independent measurements,
@@ -293,7 +311,7 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Findi
     than noise. Over such small steps the closure equations are linear, so the mean of the rows is a
     reading of the mean pose.
     """
-    first, group = np.unique(same_pose(table.values, noise), return_inverse=True)
+    first, group = np.unique(same_pose(readings.values, noise), return_inverse=True)
     if len(first) == len(group):
         return table, []
     total = np.zeros((len(first), table.values.shape[1]))
