@@ -247,6 +247,15 @@ def _reading_plays(
     yield from readings.play_columns(measured.joints, names, units)
 
 
+def _eccentric_encoders(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Cranks whose encoders' discs are not centred."""
+    del observation, estimate
+    names, units = session.document["joints"]["columns"], session.machine.joint_units
+    yield from readings.eccentricity_columns(measured.joints, names, units)
+
+
 def _lenses(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
@@ -481,7 +490,7 @@ def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
 
 
 TESTED = (
-    _reading_scales, _reading_plays, _leaning_towers, _screw_leads, _joint_offsets, _lenses,
-    _lenses_of_stations, _boards, _tripods,
+    _reading_scales, _reading_plays, _eccentric_encoders, _leaning_towers, _screw_leads,
+    _joint_offsets, _lenses, _lenses_of_stations, _boards, _tripods,
 )  # fmt: skip
 """What a session takes for granted and that may be otherwise; each is a family of columns."""

@@ -244,6 +244,26 @@ def play_columns(joints: Array, columns: Sequence[str], units: Sequence[str]) ->
         yield Column("readings.play", name, "backlash", readings=by, facts=facts)
 
 
+def eccentricity_columns(
+    joints: Array, columns: Sequence[str], units: Sequence[str]
+) -> Iterator[Column]:
+    """Eccentric encoder discs on cranks: readings (K, m) are off by a sine of their own angle, once
+    per turn, with any phase. A disc that is off its axis by e reads e / radius too much at most.
+    """
+    for m, (name, unit) in enumerate(zip(columns, units, strict=True)):
+        if unit != "rad":
+            continue
+
+        def facts(value: Array, sigma: Array, name: str = name) -> dict[str, Any]:
+            size = float(np.linalg.norm(value))
+            spread = float(np.linalg.norm(value * sigma)) / size if size else float(max(sigma))
+            return {"column": name, "value": size, "sigma": spread, "sine_cosine": value.tolist()}
+
+        by = np.zeros((*joints.shape, 2))
+        by[:, m] = np.stack([np.sin(joints[:, m]), np.cos(joints[:, m])], axis=-1)
+        yield Column("readings.eccentric", name, "eccentric encoder", readings=by, facts=facts)
+
+
 def wrong_reading(column: str, unit: str, configuration: str, by: Array | None = None) -> Column:
     """Column of one wrong reading; by : (K, m, 1), one at that reading."""
 

@@ -1,0 +1,32 @@
+"""Cranks with eccentric encoders."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pkmcal.calibration.calibrate import calibrate_session
+from test_pose_sessions import make, write_joints
+
+
+def eccentric(folder, amplitude, seed=0, phase=0.5, name="delta"):
+    """A session in which the second crank's encoder reads too much by a sine of its angle."""
+    made = make(folder, name, n=60, seed=seed)
+    readings = made.joints.copy()
+    readings[:, 1] += amplitude * np.sin(readings[:, 1] + phase)
+    write_joints(folder, readings)
+    return folder
+
+
+def test_an_eccentric_encoder_is_named(tmp_path):
+    amplitude, phase = 1e-2, 0.5
+    result = calibrate_session(eccentric(tmp_path / "session", amplitude, phase=phase))
+    (one,) = result.violations
+    assert (one.code, one.of) == ("readings.eccentric", "motor2")
+    truth = -amplitude * np.array([np.cos(phase), np.sin(phase)])
+    np.testing.assert_array_less(np.abs(one.value - truth), 4 * one.sigma)
+    assert one.finding.facts["value"] == pytest.approx(amplitude, abs=0.5 * amplitude)
+
+
+def test_a_centred_one_is_not(tmp_path):
+    assert not calibrate_session(eccentric(tmp_path / "session", 0.0)).violations
