@@ -137,7 +137,9 @@ px or grey levels, speed in m/s or rad/s, rates in 1/s, durations in s."""
 AlternativeMethod = Literal["four-step", "linear", "inverse-kinematic"]
 CalibrationMethod = Literal["bundle", AlternativeMethod]
 CameraFileFormat = Literal["opencv", "ros", "kalibr"]
-CameraModelChoice = Literal["auto", "pinhole", "fisheye", "unified"]
+CameraModelChoice = Literal[
+    "auto", "pinhole", "rational", "fisheye", "unified", "extended_unified", "double_sphere"
+]
 Paper = Literal["a", "b", "c"]
 ServoLaw = Literal["edges", "directions"]
 Style = Literal["mixed", "matte", "dark", "metal"]

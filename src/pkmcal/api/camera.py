@@ -80,7 +80,7 @@ def camera(
         The board or its file; by default the session's, or board.yaml beside the images or in the
         folder above.
     model :
-        ``pinhole``, ``fisheye`` or ``unified`` (mirrors); ``auto`` selects one.
+        Camera model; ``unified`` is for mirrors, ``auto`` selects one.
     to :
         Other programs whose camera file is written as well: ``opencv``, ``ros``, ``kalibr``.
     progress :

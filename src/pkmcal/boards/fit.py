@@ -153,13 +153,13 @@ class CameraProblem:
         )
 
     def retract(self, state: CameraState, shared: Array, own: Array) -> CameraState:
-        """The state after a step; xi stays at 0 or above."""
+        """The state after a step; the model's own fields stay in their ranges."""
         intrinsics = state.intrinsics
         if len(self.free):
             intrinsics = intrinsics + shared
-            if "xi" in self.camera.parameter_names:
-                xi = self.free == self.camera.parameter_names.index("xi")
-                intrinsics[:, xi] = np.maximum(intrinsics[:, xi], 0.0)
+            shape = (self.free >= 4) & (self.free < 4 + len(self.camera.own))
+            low, high = self.camera.own_range()[:, self.free[shape] - 4]
+            intrinsics[:, shape] = np.clip(intrinsics[:, shape], low, high)
         return CameraState(intrinsics, perturb(state.T_camera_board, own))
 
     def select(self, runs: Integers) -> CameraProblem:

@@ -22,7 +22,7 @@ from pkmcal.boards.fit import (
     views_of,
 )
 from pkmcal.camera_calibration.model_selection import (
-    DISTORTION_CANDIDATES,
+    CALIBRATED_MODELS,
     MODEL_SELECTION_OPTIONS,
     Candidate,
     HeldOut,
@@ -148,6 +148,11 @@ class CameraCalibration:
         ]
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
+    def correlated_with(self, name: str) -> list[str]:
+        """Intrinsics that are determined only together with ``name``, with the correlations."""
+        pairs = [pair for pair in self.correlations if name in pair]
+        return [f"{a if b == name else b} ({rho:+.3f})" for a, b, rho in pairs]
+
     def as_dict(self) -> dict[str, Any]:
         """Calibration as plain data for JSON, with the camera as in its file."""
         names = self.camera.parameter_names
@@ -207,7 +212,7 @@ def calibrate_camera(
 ) -> CameraCalibration:
     """Calibrate a camera from detected corners.
 
-    model : pinhole, fisheye, unified, or auto.
+    model : a camera model's name, or auto.
     Raises `InputError` if the views are too few or `model` does not fit, and `ResultError` if the
     views do not determine the camera.
     """
@@ -262,7 +267,7 @@ def calibrate_camera(
 
 def _check_model_name(model: str) -> None:
     """Raise InputError for an unknown camera model."""
-    models = ("auto", *DISTORTION_CANDIDATES)
+    models = ("auto", *CALIBRATED_MODELS)
     if model not in models:
         raise InputError(
             "no such camera model",
@@ -455,9 +460,6 @@ def calibration_findings(
     for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True):
         if rms > options.outlying_view * middle:
             yield doubtful("lens.odd_view", name, scale=rms / middle)
-    # intrinsics that are determined only together with xi
-    others = [
-        f"{a if b == 'xi' else b} ({rho:+.3f})" for a, b, rho in c.correlations if "xi" in (a, b)
-    ]
-    if c.camera.model == "unified" and others:
-        yield doubtful("lens.xi_correlated", others=others)
+    for name in c.camera.own:
+        if others := c.correlated_with(name):
+            yield doubtful("lens.own_correlated", name, others=others)

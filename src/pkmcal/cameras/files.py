@@ -15,6 +15,7 @@ from pkmcal.cameras.colmap import is_colmap, read_colmap
 from pkmcal.cameras.contract import LEAST_FOCAL, Camera, camera_models
 from pkmcal.cameras.foreign import Intrinsics, named_entry
 from pkmcal.cameras.mrcal import is_mrcal, read_mrcal
+from pkmcal.cameras.pinhole import PINHOLE_TERMS
 from pkmcal.cameras.visp import is_visp, read_visp
 from pkmcal.errors import InputError
 from pkmcal.files import (
@@ -174,8 +175,6 @@ _ROS = {
 _ROS_ZERO = ("", "none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 """Distortion models that drivers write for images without distortion; supported where all
 coefficients are zero."""
-_PINHOLE_TERMS = 5
-"""Coefficients of OpenCV's model up to which it is the pinhole model."""
 _KALIBR = {
     ("pinhole", "radtan"): "pinhole",
     ("pinhole", "none"): "pinhole",
@@ -348,7 +347,7 @@ def _from_ros(document: Document) -> Camera:
 
 def _opencv_model(k: Array) -> str:
     """The simpler of pinhole and rational that has all non-zero coefficients of OpenCV's model."""
-    return "rational" if np.any(k[_PINHOLE_TERMS:]) else "pinhole"
+    return "rational" if np.any(k[PINHOLE_TERMS:]) else "pinhole"
 
 
 def _from_intrinsics(given: Intrinsics) -> Camera:
