@@ -15,7 +15,6 @@ from pkmcal.boards.poses import (
     one_a_configuration,
     standing_board,
 )
-from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose, pose_difference, rotation
 from test_boards import CAMERAS, FILES, board_of, render

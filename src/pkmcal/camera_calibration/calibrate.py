@@ -460,6 +460,9 @@ def calibration_findings(
     for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True):
         if rms > options.outlying_view * middle:
             yield doubtful("lens.odd_view", name, scale=rms / middle)
-    for name in c.camera.own:
-        if others := c.correlated_with(name):
-            yield doubtful("lens.own_correlated", name, others=others)
+    tied = {name: c.correlated_with(name) for name in c.camera.own}
+    yield from (
+        doubtful("lens.own_correlated", name, others=others)
+        for name, others in tied.items()
+        if others
+    )

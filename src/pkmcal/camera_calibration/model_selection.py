@@ -293,9 +293,8 @@ def camera_candidates(
             fit = extended(start, views, terms)
             fits.append((model, terms, fit))
             radial = sum(name.startswith("k") for name in terms)
-            if radial >= options.hopeless_terms and _median_residual(
-                fit
-            ) > options.hopeless_ratio * min(_median_residual(f) for _, _, f in fits):
+            hopeless = options.hopeless_ratio * min(_median_residual(f) for _, _, f in fits)
+            if radial >= options.hopeless_terms and _median_residual(fit) > hopeless:
                 break
             # a larger set starts from this fit
             start = fit if "k1" in terms else start
