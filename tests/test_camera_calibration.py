@@ -35,6 +35,7 @@ from pkmcal.camera_calibration.model_selection import (
     positions,
     starting_cameras,
 )
+from pkmcal.camera_calibration.uncertainty import board_motion, projection_covariance
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
@@ -239,6 +240,33 @@ def test_sigma_is_honest(true):
     spread = np.sqrt(np.mean(np.square(scaled), axis=0))
     assert np.all((spread > 0.65) & (spread < 1.4)), spread
     assert np.mean(np.abs(scaled) < 1) == pytest.approx(0.68, abs=0.08)
+
+
+@pytest.mark.parametrize("distance", [0.5, np.inf])
+def test_the_uncertainty_of_projection_covers_the_truth(distance):
+    """Over many calibrations from new noise, the pixel of a point that stands still relative to the
+    boards scatters as stated, in the middle, at the border and beyond the corners.
+    """
+    true = TRUE["pinhole"]
+    poses, free = poses_for(true, 8, 5), positions(true, TERMS["pinhole"])
+    pixels = np.array([[512.0, 384.0], [100.0, 100.0], [990.0, 384.0], [1010.0, 755.0]])
+    far = 1e7 if np.isinf(distance) else distance
+    in_board = apply(np.linalg.inv(poses)[:, None], true.ray(pixels) * far)
+    squares = []
+    for seed in range(60):
+        views = views_of(detections(true, poses, seed), BOARD)
+        fit = fit_camera(true, free, views, poses)
+        covariance, of_poses, by = covariance_of(fit, views)
+        motion = board_motion(fit.T_camera_board, of_poses, by, covariance)
+        stated = projection_covariance(fit.camera, covariance, motion, pixels, distance)
+        point = apply(fit.T_camera_board[:, None], in_board).mean(axis=0)
+        off = fit.camera.project(point) - pixels
+        squares.append(np.einsum("ki,kij,kj->k", off, np.linalg.inv(stated), off))
+    # chi-square with two degrees of freedom: mean 2, 68.3 % below 2.30 and 95.4 % below 6.18
+    squares = np.array(squares)
+    assert np.all(np.abs(squares.mean(axis=0) - 2) < 0.9)
+    assert np.mean(squares < 2.30) == pytest.approx(0.683, abs=0.1)
+    assert np.mean(squares < 6.18) == pytest.approx(0.954, abs=0.05)
 
 
 def test_opencv_agrees():

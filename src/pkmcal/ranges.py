@@ -82,6 +82,7 @@ _SEED = _whole(0, 2**63 - 1, 0)
 RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
     {
         "calibrate": {"seed": _SEED, "holdout": _whole(0, 100_000, 0)},
+        "camera": {"distance": Range(0, 1000, above=True, unit="m")},
         "check": {"seed": _SEED},
         "new": {"places": _whole(1, 20), **dict.fromkeys(FAMILY_DIMENSIONS, _DIMENSION)},
         "plan": {

@@ -67,6 +67,7 @@ def camera(
     *,
     board: Board | Path | str | None = None,
     model: CameraModelChoice = "auto",
+    distance: float | None = None,
     to: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> CameraResult:
@@ -81,6 +82,9 @@ def camera(
         folder above.
     model :
         Camera model; ``unified`` is for mirrors, ``auto`` selects one.
+    distance :
+        Distance of points from the camera, m, for the map of the projection's uncertainty beside
+        that at infinity; by default the median of the boards.
     to :
         Other programs whose camera file is written as well: ``opencv``, ``ros``, ``kalibr``.
     progress :
@@ -106,7 +110,7 @@ def camera(
         )
     with whole(progress, "Reading the board") as report:
         paths, described = _images_and_board(images, board)
-        calibration = calibrate_images(paths, described, model, report)
+        calibration = calibrate_images(paths, described, model, report, distance)
     return CameraResult.of(calibration, images=tuple(paths), formats=tuple(dict.fromkeys(to)))
 
 

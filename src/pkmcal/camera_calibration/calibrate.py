@@ -35,10 +35,17 @@ from pkmcal.camera_calibration.model_selection import (
     spread_of_views,
     thinned,
 )
+from pkmcal.camera_calibration.uncertainty import (
+    BoardMotion,
+    board_motion,
+    largest_sigma,
+    pixel_grid,
+    projection_covariance,
+)
 from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError, ResultError
-from pkmcal.files import closest
-from pkmcal.geometry.rigid import dot
+from pkmcal.files import closest, json_value
+from pkmcal.geometry.rigid import apply, dot
 from pkmcal.levels import MAJORITY
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.progress import Progress, no_progress, part
@@ -78,6 +85,8 @@ class CalibrationCheckOptions:
 
 
 CALIBRATION_CHECK_OPTIONS = CalibrationCheckOptions()
+UNCERTAINTY_CELLS = (32, 24)
+"""Columns and rows of cells in which the projection's uncertainty is computed."""
 STRONG_CORRELATION = 0.95
 """Correlation from which two intrinsics are reported as hardly separable."""
 
@@ -92,6 +101,7 @@ class CameraCalibration:
     views : names of the V images used.
     T_camera_board : (V, 4, 4) m.
     pose_covariance : (V, 6, 6), left perturbation, with the intrinsics' uncertainty.
+    motion : mean motion of the boards, for the projection's uncertainty.
     pixels : (V, N, 2) detected corners, NaN where not detected.
     residuals : (V, N, 2) px, predicted minus detected.
     weight : (V, N) IRLS weights, 0 to 1.
@@ -99,6 +109,7 @@ class CameraCalibration:
     rms, held_out : px, root mean square of the residuals' lengths, on the views used, and on views
         held out of the estimate of the camera (their poses are fitted).
     compared : all candidate models and sets of coefficients.
+    distance : m, of the projection's uncertainty that is not at infinity.
     """
 
     camera: Camera
@@ -108,6 +119,7 @@ class CameraCalibration:
     views: tuple[str, ...]
     T_camera_board: Array
     pose_covariance: Array
+    motion: BoardMotion
     pixels: Array
     residuals: Array
     weight: Array
@@ -117,6 +129,7 @@ class CameraCalibration:
     compared: tuple[Candidate, ...]
     board: Board
     detections: tuple[Detection, ...]
+    distance: float
     findings: tuple[Finding, ...]
 
     @property
@@ -128,6 +141,22 @@ class CameraCalibration:
     def sigma(self) -> Array:
         """Standard deviations (n,) of the intrinsics, 0 for those not estimated."""
         return np.sqrt(np.diag(self.covariance))
+
+    def projection_sigma(self, pixels: Array, distance: float = np.inf) -> Array:
+        """Standard deviation (...) px of the pixels of fixed points, in the worst direction.
+
+        pixels : (..., 2). distance : m, of the points from the camera. NaN for pixels without a
+        ray.
+        """
+        return largest_sigma(
+            projection_covariance(self.camera, self.covariance, self.motion, pixels, distance)
+        )
+
+    def projection_map(self, distance: float) -> Array:
+        """``projection_sigma`` in the middles of the image's cells, (rows, columns)."""
+        return self.projection_sigma(
+            pixel_grid(self.camera.image_size, UNCERTAINTY_CELLS), distance
+        )
 
     @property
     def inliers(self) -> Booleans:
@@ -165,6 +194,13 @@ class CameraCalibration:
                 )
             ],
             "covariance": self.covariance.tolist(),
+            "projection_sigma": [
+                {
+                    "distance": distance,
+                    "sigma": json_value(self.projection_map(distance or np.inf)),
+                }
+                for distance in (None, self.distance)
+            ],
             "views_disagree_by": self.spread,
             "rms": self.rms,
             "held_out_rms": self.held_out.rms,
@@ -196,12 +232,13 @@ def calibrate_images(
     board: Board,
     model: str = "auto",
     progress: Progress = no_progress,
+    distance: float | None = None,
 ) -> CameraCalibration:
     """Detect the board in images of one size and calibrate their camera."""
     _check_model_name(model)
     detections = detect_boards(paths, board, progress=part(progress, 0, 0.6))
     progress("Calibrating the camera", 0.6)
-    return calibrate_camera(detections, board, model)
+    return calibrate_camera(detections, board, model, distance=distance)
 
 
 def calibrate_camera(
@@ -209,10 +246,12 @@ def calibrate_camera(
     board: Board,
     model: str = "auto",
     options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
+    distance: float | None = None,
 ) -> CameraCalibration:
     """Calibrate a camera from detected corners.
 
-    model : a camera model's name, or auto.
+    model : a camera model's name, or auto. distance : m, of points whose projection's uncertainty
+    is computed; by default the median of the boards' middles.
     Raises `InputError` if the views are too few or `model` does not fit, and `ResultError` if the
     views do not determine the camera.
     """
@@ -232,7 +271,7 @@ def calibrate_camera(
     # Fit all corners, with the covariance scaled by the disagreement of the views.
     fit = fitted_to_all(chosen, views)
     check_corners(fit, views, board, options=options)
-    by_noise, poses_by_noise, _ = covariance_of(fit, views)
+    by_noise, poses_by_noise, by_intrinsics = covariance_of(fit, views)
     spread = spread_of_views(fit, views, selection)
     covariance = by_noise * spread**2
     check_determined(fit, covariance, views, options=options)
@@ -249,6 +288,9 @@ def calibrate_camera(
         views=tuple(detection.name for detection in used),
         T_camera_board=fit.T_camera_board,
         pose_covariance=poses_by_noise * spread**2,
+        motion=board_motion(
+            fit.T_camera_board, poses_by_noise * spread**2, by_intrinsics, covariance
+        ),
         pixels=views.pixels,
         residuals=fit.residuals,
         weight=fit.weight,
@@ -258,11 +300,18 @@ def calibrate_camera(
         compared=pool,
         board=board,
         detections=tuple(detections),
+        distance=distance or _median_distance(fit.T_camera_board, views.points),
         findings=(),
     )
     return replace(
         calibration, findings=(*model_warnings, *calibration_findings(calibration, options=options))
     )
+
+
+def _median_distance(T_camera_board: Array, points: Array) -> float:
+    """Median distance of boards' middles from the camera, m."""
+    middles = apply(T_camera_board, points.mean(axis=0))
+    return float(np.median(np.linalg.norm(middles, axis=-1)))
 
 
 def _check_model_name(model: str) -> None:
