@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,21 +61,41 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
         return _from_intrinsics(read_mrcal(text, label))
     if is_colmap(text):
         return _from_intrinsics(read_colmap(text, label, camera))
-    if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
+    if _is_opencv(text):
         return _from_opencv(text, label)
     document = parse_yaml(text, path, label)
-    cameras = [
-        key
-        for key, entry in document.data.items()
-        if isinstance(entry, dict) and "camera_model" in entry  # Kalibr's format
-    ]
-    if cameras:
+    if cameras := _kalibr_names(document.data):
         return _from_kalibr(document, cameras, camera)
     if camera is not None:
         raise _without_names(label, camera)
     if "camera_matrix" in document.data:
         return _from_ros(document)
     return camera_from_document(document)
+
+
+def is_camera_file(path: Path | str) -> bool:
+    """Whether a path, with or without a # and a name, leads to a camera's file."""
+    path, _ = camera_path(path)
+    if not path.is_file():
+        return False
+    text = read_text(path, path.name, LARGEST_WRITTEN_FILE)
+    if any(one(text) for one in (is_visp, is_mrcal, is_colmap)) or _is_opencv(text):
+        return True
+    if path.suffix not in (".yaml", ".yml"):
+        return False
+    data = parse_yaml(text, path, path.name).data
+    own = data.get("model") in camera_models()
+    return own or "camera_matrix" in data or bool(_kalibr_names(data))
+
+
+def _is_opencv(text: str) -> bool:
+    """Whether a text is a file of OpenCV's FileStorage."""
+    return "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv"))
+
+
+def _kalibr_names(data: Mapping[str, Any]) -> list[str]:
+    """Names of the cameras in Kalibr's format."""
+    return [key for key, one in data.items() if isinstance(one, dict) and "camera_model" in one]
 
 
 def _without_names(label: str, camera: str) -> InputError:
