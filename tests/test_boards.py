@@ -308,10 +308,35 @@ def test_a_layout_is_that_of_the_markers_whatever_the_lens(tmp_path):
 
 
 def test_two_boards_mixed(pictures):
+    """A minority of images with another board is not used, with the reason; a majority refused."""
     board, paths = pictures["charuco"]
+    other = pictures["chessboard"][1]
+    *right, odd = detect_boards([*paths, other[0]], board)
+    assert all(detection.success for detection in right)
+    assert not odd.success
+    assert "a chessboard of 8x5 inner corners" in odd.reason
     with pytest.raises(InputError, match="two boards are mixed") as caught:
-        detect_boards([*paths, pictures["chessboard"][1][0]], board)
+        detect_boards([paths[0], *other[:2]], board)
     assert caught.value.found == "a chessboard of 8x5 inner corners"
+
+
+def test_a_board_without_readable_markers_is_no_other_board(tmp_path, pictures):
+    """White paper over the markers of one image, of which the squares are a chessboard then."""
+    board, paths = pictures["charuco"]
+    detection = detect_boards(paths, board)[0]
+    image = cv2.imread(str(paths[0]), cv2.IMREAD_GRAYSCALE)
+    homography, _ = cv2.findHomography(board.points[detection.ids, :2], detection.pixels)
+    square, half = board.document["square"], board.document["marker"] * 0.55
+    for row, column in np.ndindex(*board.document["squares"][::-1]):
+        if (row + column) % 2:
+            middle = (np.array([column, row]) + 0.5) * square
+            sides = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+            quad = cv2.perspectiveTransform(sides[None], homography)
+            cv2.fillPoly(image, [np.rint(quad[0]).astype(np.int32)], int(image.max()))
+    cv2.imwrite(str(tmp_path / "unread.png"), image)
+    *right, odd = detect_boards([*paths, tmp_path / "unread.png"], board)
+    assert all(one.success for one in right)
+    assert not odd.success
 
 
 def test_no_board_anywhere(tmp_path, pictures):
