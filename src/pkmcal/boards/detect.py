@@ -162,8 +162,10 @@ def check_boards(
         image = decode(path, size, path.name)
         if board.type == "chessboard":
             other = _larger_chessboard(image, board, options)
+        elif board.type == "circle_grid":
+            other = None  # of another grid, the detector finds no part
         else:
-            markers = detect_markers(image, dictionary(board.document["dictionary"]))
+            markers = _own_markers(image, board)
             other = _markers_beyond(image, board, markers, options)
             if other is None and board.type == "charuco":
                 _check_size(markers, board, detection, path, options)
@@ -217,14 +219,18 @@ def _other_board_error(path: Path, other: str, board: Board) -> InputError:
     )
 
 
+def _own_markers(image: Integers, board: Board) -> Markers:
+    """Markers of the board's dictionary."""
+    border = board.document.get("border", 1)
+    return detect_markers(image, dictionary(board.document["dictionary"]), border=border)
+
+
 def _check_grid(
     paths: Sequence[Path], size: tuple[int, int], board: Board, options: OtherBoardOptions
 ) -> None:
     """Raise `InputError` if the layout of a grid's markers contradicts its file."""
-    aruco_dictionary = dictionary(board.document["dictionary"])
-    layout = marker_layout(
-        [detect_markers(decode(p, size, p.name), aruco_dictionary) for p in paths], options.layout
-    )
+    images = [_own_markers(decode(p, size, p.name), board) for p in paths]
+    layout = marker_layout(images, options.layout)
     if layout is None:
         return
     other = another_grid(layout, board, options.layout)
@@ -308,10 +314,10 @@ def other_board(
     part : whether a part of the described chessboard counts as another board, not as a partial
         detection.
     """
-    if board.type == "chessboard":
+    if board.type in ("chessboard", "circle_grid"):
         # Markers first: one search, where chessboards need one for each size.
         return _other_markers(image, "", options) or _other_chessboard(
-            image, board.counts, part, options
+            image, board.counts if board.type == "chessboard" else (0, 0), part, options
         )
     name = board.document["dictionary"]
     if board.type == "charuco":

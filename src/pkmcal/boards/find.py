@@ -22,6 +22,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
+from pkmcal.boards.circles import circle_centres, find_circles
 from pkmcal.solver.marquardt import Damping
 from pkmcal.solver.ranks import column_space
 
@@ -88,6 +89,8 @@ def detect_board(
         raw, mirrored, why = _chessboard(image, board, quick, options)
     elif board.type == "charuco":
         raw, mirrored, why = _charuco(image, board, options)
+    elif board.type == "circle_grid":
+        raw, mirrored, why = _circles(image, board)
     else:
         raw, mirrored, why = _marker_grid(image, board)
     size = (image.shape[1], image.shape[0])
@@ -99,7 +102,7 @@ def detect_board(
     weak = tuple(int(i) for i in ids[~good])
     least = (
         options.whole_share * len(board.points)
-        if board.type == "chessboard"
+        if board.type in ("chessboard", "circle_grid")
         else options.least_corners
     )
     xy = board.points[ids[good], :2]
@@ -196,11 +199,13 @@ class Markers(NamedTuple):
     corners: Array
 
 
-def detect_markers(image: Integers, words: Any, quick: bool = False) -> Markers:
-    """The markers of a dictionary; quick : by the finest threshold alone."""
+def detect_markers(image: Integers, words: Any, quick: bool = False, border: int = 1) -> Markers:
+    """The markers of a dictionary; quick : by the finest threshold alone. border : its modules."""
     import cv2
 
-    corners, ids, _ = cv2.aruco.ArucoDetector(words, _thresholds(quick)).detectMarkers(image)
+    how = _thresholds(quick)
+    how.markerBorderBits = border
+    corners, ids, _ = cv2.aruco.ArucoDetector(words, how).detectMarkers(image)
     if _length(ids) == 0:
         return Markers(np.zeros(0, dtype=int), np.zeros((0, 4, 2)))
     corners = np.asarray(corners, float).reshape(-1, 4, 2)
@@ -214,12 +219,19 @@ def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     for mirrored in (False, True):
         picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
         for quick, enough in ((True, count), (False, 2)):
-            ids, corners = detect_markers(picture, words, quick)
+            ids, corners = detect_markers(picture, words, quick, data.get("border", 1))
             once = ~np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
             if once.sum() >= enough:
                 values = (4 * ids[once, None] + np.arange(4)).reshape(-1)
                 return _raw(corners[once], values, image.shape[1], mirrored), mirrored, ""
     return _raw([], [], 0, False), False, "fewer than two of the board's markers are detected"
+
+
+def _circles(image: Integers, board: Board) -> tuple[Raw, bool, str]:
+    centres = find_circles(image, board)
+    if centres is None:
+        return _raw([], [], 0, False), False, f"{board.described} is not detected"
+    return (np.arange(len(centres)), centres), False, ""
 
 
 def _chessboard(
@@ -347,8 +359,11 @@ def _fitted(image: Integers, board: Board, raw: Raw, options: BoardDetectionOpti
     """The corners' fits; a grid of markers may have plain corners or touching dark squares."""
     ids, pixels = raw
     data = board.document
+    if board.type == "circle_grid":
+        centres, good, sigma = circle_centres(image, board, pixels)
+        return Corners(centres, good, sigma, np.zeros((len(ids), 7)))
     if board.type == "aruco_grid":
-        module = 1 / (marker_bits(data["dictionary"]) + 2)
+        module = 1 / (marker_bits(data["dictionary"]) + 2 * data.get("border", 1))
         reach = min(options.reach, 0.8 * data["gap"] / data["marker"])
         axes = _marker_axes(ids, pixels)
         plain = refine(
