@@ -354,7 +354,7 @@ def test_a_layout_is_that_of_the_markers_whatever_the_lens(tmp_path):
 
 
 def test_a_circles_centre_is_not_its_images_centroid(tmp_path):
-    """At a large tilt the detector finds centroids, which perspective displaces; centres are not."""
+    """At a large tilt the detector finds centroids, which perspective displaces."""
     board = board_of(tmp_path, FILES["circle_grid"])
     T_camera_board = view(board, (0.0, 0.9, 0.0), (0.0, 0.0), 0.42)
     image = render(CAMERAS["pinhole"], T_camera_board, board)

@@ -7,13 +7,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from page_documents import page_blocks, page_document
-from pkmcal.boards.board import Detection, chessboard
+from pkmcal.boards.board import Detection, board_from_document, chessboard
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.fit import (
     board_poses,
@@ -23,6 +24,7 @@ from pkmcal.boards.fit import (
     settled_poses,
     views_of,
 )
+from pkmcal.boards.shape import bend_of, board_columns, deviation
 from pkmcal.camera_calibration.calibrate import CALIBRATION_CHECK_OPTIONS, calibrate_camera
 from pkmcal.camera_calibration.model_selection import (
     CALIBRATED_MODELS,
@@ -38,6 +40,7 @@ from pkmcal.camera_calibration.model_selection import (
 from pkmcal.camera_calibration.uncertainty import board_motion, projection_covariance
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
+from pkmcal.files import Document
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
 from pkmcal.report.camera import outcome_of
 from pkmcal.web.report_page import report_page
@@ -99,12 +102,14 @@ def poses_for(camera, count, seed, tilt=0.6):
     return np.stack(results)
 
 
-def detections(camera, T_camera_board, seed=0, noise=0.05, reference_values=True, wrong=0):
+def detections(
+    camera, T_camera_board, seed=0, noise=0.05, reference_values=True, wrong=0, points=BOARD.points
+):
     """Corners of every pose with noise, the first ``wrong`` of each view 5 px off."""
     rng = np.random.default_rng(seed)
     out = []
     for k, T in enumerate(T_camera_board):
-        pixels = camera.project(apply(T, BOARD.points))
+        pixels = camera.project(apply(T, points))
         pixels = pixels + rng.normal(0, noise, pixels.shape)
         pixels[:wrong] += 5.0
         ids = np.arange(len(pixels))
@@ -391,6 +396,59 @@ def test_views_that_disagree_widen_sigma():
     assert result.spread > 1.5
     assert any("views disagree" in text for text in result.warnings)
     assert np.all(np.abs(result.camera.parameters - true.parameters)[:2] < 4 * result.sigma[:2])
+
+
+def bent_detections(bend, poses, seed):
+    """Corners of a board with a bend (2,) m in its middle."""
+    points = BOARD.points + np.tensordot(np.array(bend), bend_of(BOARD).displacement, axes=1)
+    return detections(TRUE["pinhole"], poses, seed, points=points)
+
+
+def test_a_flat_board_is_not_bent():
+    """The score tests have their distribution by chance."""
+    true, poses = TRUE["pinhole"], poses_for(TRUE["pinhole"], 10, 1)
+    free, chances = positions(true, TERMS["pinhole"]), []
+    for seed in range(40):
+        views = views_of(detections(true, poses, seed), BOARD)
+        fit = fit_camera(true, free, views, poses)
+        chances.append([deviation(fit, views, column).chance for column in board_columns(BOARD)])
+    assert np.all(np.abs(np.mean(np.array(chances) < 0.5, axis=0) - 0.5) < 0.25)
+    assert np.mean(np.array(chances) < 0.01) < 0.06
+
+
+def test_a_bent_board_is_named_or_estimated():
+    true, bend = TRUE["pinhole"], np.array([4e-4, -2e-4])
+    views = bent_detections(bend, poses_for(true, 10, 1), 3)
+    flat = calibrate_camera(views, BOARD, "pinhole", alone("pinhole"))
+    assert flat.bend is None
+    assert "lens.board_bend" in [finding.code for finding in flat.findings]
+    bent = calibrate_camera(views, BOARD, "pinhole", alone("pinhole"), bend=True)
+    assert bent.findings == ()
+    off = bent.bend.value - bend
+    assert off @ np.linalg.solve(bent.bend.covariance, off) < 12
+    assert bent.rms < 0.5 * flat.rms
+    assert bent.spread == 1.0
+    errors = [np.abs(c.camera.focal - true.focal).max() for c in (flat, bent)]
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < 4 * bent.sigma[0]
+
+
+def test_gaps_between_markers_a_few_per_cent_off_are_named():
+    """A grid of 30 mm markers with gaps of 9 mm that is described with 9.4 mm."""
+    fields = {"type": "aruco_grid", "markers": [5, 3], "marker": 0.03, "gap": 0.009}
+    right, wrong = (
+        board_from_document(
+            Document(Path(), "", {**fields, "gap": gap, "dictionary": "DICT_4X4_50"}, {})
+        )
+        for gap in (0.009, 0.0094)
+    )
+    true, poses = TRUE["pinhole"], poses_for(TRUE["pinhole"], 10, 1)
+    values = detections(true, poses, 2, points=right.points)
+    named = calibrate_camera(values, wrong, "pinhole", alone("pinhole"))
+    (finding,) = (one for one in named.findings if one.code == "lens.board_gap")
+    assert finding.facts["value"] == pytest.approx(-4e-4, abs=1e-4)
+    clean = calibrate_camera(values, right, "pinhole", alone("pinhole"))
+    assert "lens.board_gap" not in [one.code for one in clean.findings]
 
 
 def test_linear_poses_are_exact(true):

@@ -68,6 +68,7 @@ def camera(
     board: Board | Path | str | None = None,
     model: CameraModelChoice = "auto",
     distance: float | None = None,
+    bend: bool = False,
     to: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> CameraResult:
@@ -85,6 +86,8 @@ def camera(
     distance :
         Distance of points from the camera, m, for the map of the projection's uncertainty beside
         that at infinity; by default the median of the boards.
+    bend :
+        Estimate the board's bend, two parabolas, instead of testing it only.
     to :
         Other programs whose camera file is written as well: ``opencv``, ``ros``, ``kalibr``.
     progress :
@@ -110,7 +113,7 @@ def camera(
         )
     with whole(progress, "Reading the board") as report:
         paths, described = _images_and_board(images, board)
-        calibration = calibrate_images(paths, described, model, report, distance)
+        calibration = calibrate_images(paths, described, model, report, distance, bend=bend)
     return CameraResult.of(calibration, images=tuple(paths), formats=tuple(dict.fromkeys(to)))
 
 

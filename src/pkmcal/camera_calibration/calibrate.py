@@ -19,8 +19,10 @@ from pkmcal.boards.fit import (
     Views,
     check_numbering,
     covariance_of,
+    fit_camera,
     views_of,
 )
+from pkmcal.boards.shape import BoardDeviation, bend_of, board_columns, deviation, rows_of
 from pkmcal.camera_calibration.model_selection import (
     CALIBRATED_MODELS,
     MODEL_SELECTION_OPTIONS,
@@ -46,7 +48,7 @@ from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, json_value
 from pkmcal.geometry.rigid import apply, dot
-from pkmcal.levels import MAJORITY
+from pkmcal.levels import MAJORITY, NEGLIGIBLE
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.solver.kernels import INLIER_WEIGHT
@@ -75,6 +77,10 @@ class CalibrationCheckOptions:
     # tilt of a board in degrees below which views all have the same information on the focal
     # length, which is little
     facing_tilt: float = 15.0
+    # most steps in which a board's bend and the rest are estimated in turn; two or three suffice
+    bend_steps: int = 10
+    # probability by chance below which a deviation of the board from its file is reported
+    deviation_alpha: float = 1e-3
     # columns and rows of cells by which the coverage of the image is counted
     cells: tuple[int, int] = (8, 6)
     # share of cells with corners below which a warning is given
@@ -109,6 +115,8 @@ class CameraCalibration:
     rms, held_out : px, root mean square of the residuals' lengths, on the views used, and on views
         held out of the estimate of the camera (their poses are fitted).
     compared : all candidate models and sets of coefficients.
+    bend : estimated bend of the board; None if it is taken to be flat.
+    deviations : of the board from its file, tested only.
     distance : m, of the projection's uncertainty that is not at infinity.
     """
 
@@ -129,6 +137,8 @@ class CameraCalibration:
     compared: tuple[Candidate, ...]
     board: Board
     detections: tuple[Detection, ...]
+    bend: BoardDeviation | None
+    deviations: tuple[BoardDeviation, ...]
     distance: float
     findings: tuple[Finding, ...]
 
@@ -222,6 +232,8 @@ class CameraCalibration:
             ],
             "not_used": {d.name: d.reason for d in self.detections if not d.success},
             "board": self.board.document,
+            "board_bend": None if self.bend is None else _deviation_document(self.bend),
+            "board_deviations": {one.code: _deviation_document(one) for one in self.deviations},
             "warnings": list(self.warnings),
             "findings": [one.document() for one in self.findings],
         }
@@ -233,12 +245,14 @@ def calibrate_images(
     model: str = "auto",
     progress: Progress = no_progress,
     distance: float | None = None,
+    *,
+    bend: bool = False,
 ) -> CameraCalibration:
     """Detect the board in images of one size and calibrate their camera."""
     _check_model_name(model)
     detections = detect_boards(paths, board, progress=part(progress, 0, 0.6))
     progress("Calibrating the camera", 0.6)
-    return calibrate_camera(detections, board, model, distance=distance)
+    return calibrate_camera(detections, board, model, distance=distance, bend=bend)
 
 
 def calibrate_camera(
@@ -247,11 +261,13 @@ def calibrate_camera(
     model: str = "auto",
     options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
     distance: float | None = None,
+    *,
+    bend: bool = False,
 ) -> CameraCalibration:
     """Calibrate a camera from detected corners.
 
     model : a camera model's name, or auto. distance : m, of points whose projection's uncertainty
-    is computed; by default the median of the boards' middles.
+    is computed; by default the median of the boards' middles. bend : estimate the board's bend.
     Raises `InputError` if the views are too few or `model` does not fit, and `ResultError` if the
     views do not determine the camera.
     """
@@ -260,18 +276,18 @@ def calibrate_camera(
     check_enough(used, len(detections), options=options)
     image_size = used[0].image_size
     views = views_of(used, board)
-    # Choose the model and its coefficients on a subset of the corners.
-    selection = options.selection
-    pool = camera_candidates(thinned(views, selection), image_size, selection.models, selection)
-    mine = tuple(c for c in pool if model in ("auto", c.model))
-    if not mine:
-        raise no_fit(model, pool)
-    chosen = best_of(mine, selection)
+    selection, bent = options.selection, None
+    pool, chosen, fit = _selected_fit(views, image_size, model, selection)
+    if bend:
+        fit, views, bent = _bent_board(fit, views, board, None, options)
+        # The bend hides coefficients of the lens, which are selected again.
+        pool, chosen, fit = _selected_fit(views, image_size, model, selection)
+        fit, views, bent = _bent_board(fit, views, board, bent, options)
     model_warnings = check_model(model, chosen, best_of(pool, selection), options=options)
-    # Fit all corners, with the covariance scaled by the disagreement of the views.
-    fit = fitted_to_all(chosen, views)
     check_corners(fit, views, board, options=options)
-    by_noise, poses_by_noise, by_intrinsics = covariance_of(fit, views)
+    # Covariance, scaled by the disagreement of the views.
+    beside = rows_of(fit, views, bend_of(board)) if bend else None
+    by_noise, poses_by_noise, by_intrinsics = covariance_of(fit, views, beside)
     spread = spread_of_views(fit, views, selection)
     covariance = by_noise * spread**2
     check_determined(fit, covariance, views, options=options)
@@ -280,6 +296,11 @@ def calibrate_camera(
     check_explained(tested.rms, fit.camera, options)
     inliers = (fit.weight >= INLIER_WEIGHT) & views.visible
     lengths = np.sum(np.nan_to_num(fit.residuals) ** 2, axis=-1)
+    deviations = tuple(
+        deviation(fit, views, column)
+        for column in board_columns(board)
+        if not (bend and column.code == "bend")
+    )
     calibration = CameraCalibration(
         camera=replace(fit.camera, covariance=covariance),
         terms=chosen.terms,
@@ -300,12 +321,59 @@ def calibrate_camera(
         compared=pool,
         board=board,
         detections=tuple(detections),
+        bend=bent,
+        deviations=deviations,
         distance=distance or _median_distance(fit.T_camera_board, views.points),
         findings=(),
     )
     return replace(
         calibration, findings=(*model_warnings, *calibration_findings(calibration, options=options))
     )
+
+
+def _deviation_document(one: BoardDeviation) -> dict[str, Any]:
+    """Amplitudes of a board's deviation as plain data, m, or relative for a stretch."""
+    sigma = np.sqrt(np.diag(one.covariance))
+    return {"value": one.value.tolist(), "sigma": sigma.tolist(), "chance": one.chance}
+
+
+def _selected_fit(
+    views: Views, image_size: tuple[int, int], model: str, options: ModelSelectionOptions
+) -> tuple[tuple[Candidate, ...], Candidate, CameraFit]:
+    """All candidates and the selected one, on a subset of the corners, and its fit to all corners.
+
+    Raises InputError if a named model has no fit.
+    """
+    pool = camera_candidates(thinned(views, options), image_size, options.models, options)
+    mine = tuple(c for c in pool if model in ("auto", c.model))
+    if not mine:
+        raise no_fit(model, pool)
+    chosen = best_of(mine, options)
+    return pool, chosen, fitted_to_all(chosen, views)
+
+
+def _bent_board(
+    fit: CameraFit,
+    views: Views,
+    board: Board,
+    before: BoardDeviation | None,
+    options: CalibrationCheckOptions,
+) -> tuple[CameraFit, Views, BoardDeviation]:
+    """Fit with the board's bend, which is estimated in turn with the rest.
+
+    before : the bend of ``views.points``; None for a flat board.
+    """
+    column, value = bend_of(board), np.zeros(2) if before is None else before.value
+    step = deviation(fit, views, column)
+    for _ in range(options.bend_steps):
+        value = value + step.value
+        points = board.points + np.tensordot(value, column.displacement, axes=1)
+        views = views._replace(points=points)
+        fit = fit_camera(fit.camera, fit.free, views, fit.T_camera_board)
+        step = deviation(fit, views, column)
+        if np.all(np.abs(step.value) < NEGLIGIBLE * np.sqrt(np.diag(step.covariance))):
+            break
+    return fit, views, step._replace(value=value)
 
 
 def _median_distance(T_camera_board: Array, points: Array) -> float:
@@ -323,6 +391,21 @@ def _check_model_name(model: str) -> None:
             found=model,
             expected=closest(model, models) or listed(models),
         )
+
+
+def _deviation_findings(
+    c: CameraCalibration, options: CalibrationCheckOptions
+) -> Iterator[Finding]:
+    """Warnings about a board that deviates from its file."""
+    for one in c.deviations:
+        if one.chance < options.deviation_alpha:
+            largest = int(np.argmax(np.abs(one.value)))
+            yield doubtful(
+                f"lens.board_{one.code}",
+                value=float(one.value[largest]),
+                sigma=float(np.sqrt(one.covariance[largest, largest])),
+                focal_shift=float(np.mean(one.focal_shift)),
+            )
 
 
 def check_enough(
@@ -493,6 +576,7 @@ def calibration_findings(
         yield doubtful("lens.some_mirrored", listed(mirrored), names=mirrored)
     elif mirrored:
         yield doubtful("lens.all_mirrored", number=len(mirrored), first=mirrored[0])
+    yield from _deviation_findings(c, options)
     if c.spread > 1:
         yield doubtful("lens.views_disagree", scale=c.spread)
     most = float(tilts(c.T_camera_board, c.board.points).max())

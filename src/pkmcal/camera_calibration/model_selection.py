@@ -66,6 +66,9 @@ class ModelSelectionOptions:
     # are tried
     hopeless_ratio: float = 5.0
     hopeless_terms: int = 2
+    # median residual, px, up to which a model is not hopeless: tangential terms alone may be
+    # missing, of which sharp images show hundredths of a pixel
+    hopeless_residual: float = 0.5
 
 
 MODEL_SELECTION_OPTIONS = ModelSelectionOptions()
@@ -293,7 +296,8 @@ def camera_candidates(
             fit = extended(start, views, terms)
             fits.append((model, terms, fit))
             radial = sum(name.startswith("k") for name in terms)
-            hopeless = options.hopeless_ratio * min(_median_residual(f) for _, _, f in fits)
+            best_residual = min(_median_residual(f) for _, _, f in fits)
+            hopeless = max(options.hopeless_ratio * best_residual, options.hopeless_residual)
             if radial >= options.hopeless_terms and _median_residual(fit) > hopeless:
                 break
             # a larger set starts from this fit

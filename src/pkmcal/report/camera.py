@@ -27,7 +27,7 @@ from pkmcal.outcome.blocks.plot import panels
 from pkmcal.outcome.blocks.text import Listing, Paragraph
 from pkmcal.report.camera_plots import field_plots, models_plot, uncertainty_plot
 from pkmcal.report.field import ImageField, field_image
-from pkmcal.wording import brief, count, decimals, number
+from pkmcal.wording import Chance, brief, count, decimals, number
 
 VIEW_RESIDUAL_ARROW_LENGTH = 0.05
 """Length of a large residual's arrow, in image widths."""
@@ -83,7 +83,7 @@ def outcome_of(
             Part(
                 "intrinsics",
                 "Intrinsics",
-                tables=(_intrinsics(c),),
+                tables=(_intrinsics(c), _board(c)),
                 notes=(hardly,) if together else (),
             ),
             Part(
@@ -148,6 +148,28 @@ def _intrinsics(c: CameraCalibration) -> Table:
         )
         rows.append(Row(INTRINSIC_WORDS.get(name, name), (*cells, unit)))
     return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
+
+
+def _board(c: CameraCalibration) -> Table:
+    """Table of the board's deviations from its file: estimated, or tested only."""
+    rows: list[Row] = []
+    for one in (*((c.bend,) if c.bend else ()), *c.deviations):
+        sides = (" along x", " along y") if len(one.value) > 1 else ("",)
+        for side, value, sigma in zip(
+            sides, one.value.tolist(), np.sqrt(np.diag(one.covariance)).tolist(), strict=True
+        ):
+            factor, unit = (100.0, "%") if one.code == "stretch" else (1e3, "mm")
+            places = decimals(sigma * factor)
+            state = "estimated" if one is c.bend else Chance(one.chance)
+            cells = (number(value * factor, places, signed=True), brief(sigma * factor), unit)
+            rows.append(Row(f"{one.code}{side}", (*cells, state)))
+    note = (
+        "Estimated, or the values that these would have if they were, with the probability of as"
+        " large ones by chance. Bend: out of the plane, of the middle from the border. Stretch: of"
+        " x against y."
+    )
+    columns = ("The board beside its file", "value", "1σ", "unit", "chance")
+    return Table("", columns, tuple(rows), note, brief=c.bend is not None, words=(3,))
 
 
 def _projection(c: CameraCalibration, distances: Sequence[float]) -> Table:
