@@ -173,11 +173,13 @@ def check_boards(
             break
     if other is not None:
         raise _other_board_error(with_board[0], other, board)
-    out = list(detections)
-    for path, k in missed[: options.images]:
-        other = other_board(
-            decode(path, size, path.name), board, part=not with_board, options=options
+    out, part = list(detections), not with_board
+    with ThreadPoolExecutor(THREADS) as pool:
+        others = pool.map(
+            lambda file: other_board(decode(file[0], size, file[0].name), board, part, options),
+            missed[: options.images],
         )
+    for (path, k), other in zip(missed, others, strict=False):
         if other is not None and not with_board:
             raise _other_board_error(path, other, board)
         if other is not None and len(missed) > len(with_board):
