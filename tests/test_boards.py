@@ -11,6 +11,7 @@ from pkmcal.boards.circles import circle_centres, find_circles
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.find import Markers, detect_board, detect_markers, dictionary
 from pkmcal.boards.layout import another_grid, marker_layout
+from pkmcal.boards.prints import Print
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.files import yaml_text
@@ -364,6 +365,13 @@ def test_a_circles_centre_is_not_its_images_centroid(tmp_path):
     assert good.all()
     assert np.sqrt(np.mean((rough - truth) ** 2)) > 0.1
     assert np.sqrt(np.mean((centres - truth) ** 2)) < 0.02
+
+
+@pytest.mark.parametrize("kind", ["circle_grid", "kalibr_aprilgrid"])
+def test_boards_of_other_programs_are_not_printed(tmp_path, kind):
+    with pytest.raises(InputError) as caught:
+        Print.of(board_of(tmp_path, FILES[kind]))
+    assert caught.value.what == "boards of this kind are not printed"
 
 
 def test_grids_that_look_the_same_turned_by_half(tmp_path):

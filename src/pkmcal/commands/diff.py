@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 EXAMPLES = """\
 pkmcal diff last-year out
 pkmcal diff gough-stewart out
-pkmcal diff a/mechanism.yaml b/mechanism.yaml -o diff --json
-pkmcal diff cameras/front.yaml camera/camera.yaml
+pkmcal diff cameras/front.yaml camera/camera.yaml -o diff --json
 """
 
 
