@@ -9,7 +9,7 @@ from the batch.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -407,6 +407,26 @@ def forward(
         rods = np.nanmedian(np.abs(rod_lengths(layout, theta, readings)), axis=-1)
         converged = error < KINEMATICS.other_machine_gap * rods
     return ForwardResult(poses, converged, error, inner, layout, theta, readings)
+
+
+def driven_towards(
+    layout: LimbLayout,
+    theta: Array,
+    readings: Array,
+    start: Array,
+    internal: Array | None = None,
+) -> ForwardResult:
+    """Poses that a built machine takes when it is driven towards readings (..., m), with the
+    readings of its motors there; arguments as for :func:`forward`.
+
+    An overdetermined machine closes only at readings that agree with each other, so those of
+    another machine, such as its nominal model, are replaced by its own at the least-squares pose.
+    """
+    fk = forward(layout, theta, readings, start, internal)
+    if not layout.overdetermined:
+        return fk
+    exact = on_manifold(layout, theta, fk.T_base_platform)
+    return replace(exact, converged=exact.converged & fk.converged)
 
 
 def _least_squares_poses(
