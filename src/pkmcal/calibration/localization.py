@@ -19,6 +19,8 @@ from pkmcal.identify.verdict import VERDICT
 from pkmcal.levels import MAJORITY
 from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_error, reversed_motor
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
@@ -116,7 +118,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     except GeometryError as error:  # the nominal model is the user's: it is at fault
         raise error.as_input(session.document["mechanism"]) from None
     # near the ends of its workspace a nominal model that is right to its tolerance may not close
-    near = fk.error < _allowed_leg_miss(session.machine)
+    near = fk.error < _allowed_leg_miss(session.machine, fk)
     if near.all() or (most and near.mean() > MAJORITY):
         _check_turns(session, fk.T_base_platform, near)
         return fk.T_base_platform
@@ -167,22 +169,23 @@ def _closing_misfit(session: Session, joints: Array) -> float:
     """
     machine = session.machine
     fk = machine.forward_result(joints)
-    miss = fk.error / _allowed_leg_miss(machine)
+    miss = fk.error / _allowed_leg_miss(machine, fk)
     blocked = np.abs(_turn(fk.T_base_platform)) > machine.most_turn[0]
     miss = np.where(blocked | ~(miss < VERDICT.too_noisy), VERDICT.too_noisy, miss)
     return float(np.sqrt(np.mean(miss**2)))
 
 
-def _allowed_leg_miss(machine: Machine) -> float:
-    """Largest closure error, m, at readings of a machine that differs by its prior sigmas.
+def _allowed_leg_miss(machine: Machine, fk: ForwardResult) -> Array:
+    """Largest closure error (K,), m, at readings of a machine that differs by its prior sigmas.
 
     More rods than freedoms meet only in the true geometry: each misses by its own errors.
     """
-    tolerance = machine.document.tolerance
-    sigma = tolerance.center
-    if machine.layout.overdetermined:
-        sigma = float(np.hypot(np.sqrt(2) * tolerance.center, tolerance.offset))
-    return ALLOWED_LEG_MISS * sigma
+    table = machine.parameters
+    if not machine.layout.overdetermined:
+        return np.full(len(fk.error), ALLOWED_LEG_MISS * machine.document.tolerance.center)
+    c = closure(machine.layout, machine.values, fk.readings, fk.T_base_platform, fk.internal)
+    by_prior = dense(c, len(table)) @ (table.free_matrix() * table.tolerances_free())
+    return ALLOWED_LEG_MISS * np.linalg.norm(by_prior, axis=-1).max(axis=-1)
 
 
 def _turn(poses: Array) -> Array:
