@@ -11,6 +11,8 @@ from typing import Any
 
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
+from pkmcal.files import read_text
+from pkmcal.firmware.hangprinter import USES_HANGPRINTER, hangprinter_model
 from pkmcal.firmware.session import printer_session_texts
 from pkmcal.mechanisms import catalogue
 from pkmcal.outcome import Outcome, Verdict
@@ -151,7 +153,8 @@ def new(
     from_file :
         File of a hexapod's joint centres: LinuxCNC's HAL file with pins of genhexkins, or a CSV
         table with the columns leg, base_x, base_y, base_z, platform_x, platform_y, platform_z and
-        their units. With ``leg``, and where known ``travel`` and ``tube_radius``.
+        their units. With ``leg``, and where known ``travel`` and ``tube_radius``. Or, alone, the
+        configuration of a Hangprinter, with RepRapFirmware's ``M669 K6``.
     unit :
         ``mm`` or ``inch``, of the lengths in a HAL file.
     base_radius, platform_radius :
@@ -248,7 +251,17 @@ def _nominal(
                 found="--machine besides",
                 expected="one of them",
             )
-        return centres_model(Path(from_file), unit, dimensions)
+        path = Path(from_file)
+        if USES_HANGPRINTER.search(text := read_text(path)):
+            if extra := [option_of(name) for name in dimensions] + ["--unit"] * (unit is not None):
+                raise InputError(
+                    "a Hangprinter's configuration has all dimensions",
+                    where="--from",
+                    found=", ".join(extra) + " besides",
+                    expected="--from FILE alone",
+                )
+            return hangprinter_model(text, path.name)
+        return centres_model(path, unit, dimensions)
     if unit is not None:
         raise InputError(
             "a unit is named for a file of joint centres",
