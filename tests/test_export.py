@@ -24,8 +24,8 @@ from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
 
 OURS = ("c", "json", "klipper", "linuxcnc", "marlin", "repetier", "reprap", "ros", "smoothie",
         "yaml")  # fmt: skip
-ELSEWHERE = ("mujoco", "sdf", "urdf")
-"""Formats of test_export_mujoco.py and test_export_trees.py."""
+ELSEWHERE = ("hangprinter", "mujoco", "sdf", "urdf")
+"""Formats of test_hangprinter.py, test_export_mujoco.py and test_export_trees.py."""
 MACHINES = sorted(catalogue())
 DELTAS = ("delta", "linear-delta")
 HEXAPODS = ("gough-stewart", "6-spu-passive")

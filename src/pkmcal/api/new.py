@@ -13,6 +13,7 @@ from pkmcal.api.result import Result
 from pkmcal.errors import InputError
 from pkmcal.files import read_text
 from pkmcal.firmware.hangprinter import USES_HANGPRINTER, hangprinter_model
+from pkmcal.firmware.maslow import FROM_MASLOW, maslow_session_texts
 from pkmcal.firmware.session import printer_session_texts
 from pkmcal.mechanisms import catalogue
 from pkmcal.outcome import Outcome, Verdict
@@ -71,7 +72,8 @@ class NewResult(Result):
     @property
     def file_list(self) -> Mapping[str, str]:
         """Files in the order in which they are to be read."""
-        words = dict(PROBED_FILE_DESCRIPTIONS if self.complete else SESSION_FILE_DESCRIPTIONS)
+        probed = self.of_printer and self.complete
+        words = dict(PROBED_FILE_DESCRIPTIONS if probed else SESSION_FILE_DESCRIPTIONS)
         if self.of_printer:
             words["mechanism.yaml"] = PRINTER_MECHANISM_DESCRIPTION
         names = [name for name in words if name in self.texts]
@@ -154,7 +156,8 @@ def new(
         File of a hexapod's joint centres: LinuxCNC's HAL file with pins of genhexkins, or a CSV
         table with the columns leg, base_x, base_y, base_z, platform_x, platform_y, platform_z and
         their units. With ``leg``, and where known ``travel`` and ``tube_radius``. Or, alone, the
-        configuration of a Hangprinter, with RepRapFirmware's ``M669 K6``.
+        configuration of a Hangprinter, with RepRapFirmware's ``M669 K6``, or the calibration log of
+        a Maslow 4.
     unit :
         ``mm`` or ``inch``, of the lengths in a HAL file.
     base_radius, platform_radius :
@@ -204,6 +207,15 @@ def new(
         )
     if printer is None and probed is None:
         what = "both" if board and legs else "board" if board else "legs" if legs else None
+        if from_file is not None and FROM_MASLOW.search(text := read_text(Path(from_file))):
+            if extra := _besides(machine, unit, dimensions):
+                raise InputError(
+                    "a Maslow's log is a whole session",
+                    where="--from",
+                    found=f"{extra} besides",
+                    expected="--from FILE alone",
+                )
+            return NewResult(maslow_session_texts(text, Path(from_file).name), complete=True)
         nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
         return NewResult(
             session_texts(nominal, what, places or 1),
@@ -236,6 +248,13 @@ def new(
     return NewResult(texts, of_printer=True, complete=not board)
 
 
+def _besides(machine: Path | str | None, unit: str | None, dimensions: Mapping[str, float]) -> str:
+    """Options that were given besides a file that needs none of them; empty without any."""
+    given = {"--machine": machine, "--unit": unit}
+    names = [name for name, value in given.items() if value is not None]
+    return ", ".join([*names, *(option_of(name) for name in dimensions)])
+
+
 def _nominal(
     machine: str | None,
     from_file: Path | str | None,
@@ -253,11 +272,11 @@ def _nominal(
             )
         path = Path(from_file)
         if USES_HANGPRINTER.search(text := read_text(path)):
-            if extra := [option_of(name) for name in dimensions] + ["--unit"] * (unit is not None):
+            if extra := _besides(None, unit, dimensions):
                 raise InputError(
                     "a Hangprinter's configuration has all dimensions",
                     where="--from",
-                    found=", ".join(extra) + " besides",
+                    found=f"{extra} besides",
                     expected="--from FILE alone",
                 )
             return hangprinter_model(text, path.name)

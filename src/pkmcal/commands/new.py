@@ -46,7 +46,8 @@ def _dimension(name: str, described: str, usual: str = "") -> Any:
     ),
     option(
         "--from from_file", "FILE", "LinuxCNC's HAL file of genhexkins, or CSV table of a hexapod's"
-        " joint centres; with --leg. Or RepRapFirmware's configuration of a Hangprinter.", Path,
+        " joint centres; with --leg. Or RepRapFirmware's configuration of a"
+        " Hangprinter, or a Maslow 4's calibration log.", Path,
     ),
     option("--unit", "NAME", "Unit of a HAL file's lengths: mm or inch."),
     _dimension("base_radius", "Radius of the circle through the base joints, motors or towers."),
