@@ -84,15 +84,15 @@ def length_by_search(center, axis, radius, b):
     def point(t):
         return middle + radius * (-e * np.cos(t) + s * np.sin(t))
 
-    def aside(t):
+    def off_tangent(t):
         outward = -e * np.cos(t) + s * np.sin(t)
         return (b - point(t)) @ outward
 
     # of both tangents, the one in whose direction the cable came
     grid = np.linspace(-np.pi / 2 + 1e-9, 1.5 * np.pi - 1e-9, 400)
     for low, high in pairwise(grid):
-        if aside(low) * aside(high) < 0:
-            t = brentq(aside, low, high, xtol=1e-15)
+        if off_tangent(low) * off_tangent(high) < 0:
+            t = brentq(off_tangent, low, high, xtol=1e-15)
             ahead = e * np.sin(t) + s * np.cos(t)
             if (b - point(t)) @ ahead > 0:
                 return radius * t + np.linalg.norm(b - point(t)), point(t)
@@ -105,7 +105,7 @@ def test_a_cable_over_a_pulley_is_as_long_as_a_search_finds():
         parameters = np.concatenate([rng.normal(size=6), [rng.uniform(0.01, 0.1)]])
         b = parameters[:3] + rng.normal(size=3)
         length, point = length_by_search(parameters[:3], parameters[3:6], parameters[6], b)
-        a, wound = Pulley.departure(parameters, b)
+        a, wound = Pulley.tangent_point(parameters, b)
         np.testing.assert_allclose(a, point, atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(b - a) + wound, length, atol=1e-12)
 

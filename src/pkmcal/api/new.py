@@ -12,8 +12,8 @@ from typing import Any
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
 from pkmcal.files import read_text
-from pkmcal.firmware.hangprinter import USES_HANGPRINTER, hangprinter_model
-from pkmcal.firmware.maslow import FROM_MASLOW, maslow_session_texts
+from pkmcal.firmware.hangprinter import hangprinter_model, is_hangprinter
+from pkmcal.firmware.maslow import is_maslow_log, maslow_session_texts
 from pkmcal.firmware.session import printer_session_texts
 from pkmcal.mechanisms import catalogue
 from pkmcal.outcome import Outcome, Verdict
@@ -207,7 +207,7 @@ def new(
         )
     if printer is None and probed is None:
         what = "both" if board and legs else "board" if board else "legs" if legs else None
-        if from_file is not None and FROM_MASLOW.search(text := read_text(Path(from_file))):
+        if from_file is not None and is_maslow_log(text := read_text(Path(from_file))):
             if extra := _besides(machine, unit, dimensions):
                 raise InputError(
                     "a Maslow's log is a whole session",
@@ -271,7 +271,7 @@ def _nominal(
                 expected="one of them",
             )
         path = Path(from_file)
-        if USES_HANGPRINTER.search(text := read_text(path)):
+        if is_hangprinter(text := read_text(path)):
             if extra := _besides(None, unit, dimensions):
                 raise InputError(
                     "a Hangprinter's configuration has all dimensions",

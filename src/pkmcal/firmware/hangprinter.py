@@ -39,8 +39,7 @@ SPOOL_LETTERS = "RUOLH"
 """Letters of M666 with a value for each axis."""
 ANCHOR_SIGMA = 0.01
 """Standard deviation of an anchor that was measured with a tape, m."""
-USES_HANGPRINTER = re.compile(r"^[ \t]*M669[^;\n]*?[ \t]K6(?![0-9])", re.MULTILINE)
-"""Line of a configuration that makes RepRapFirmware a Hangprinter."""
+_K6 = re.compile(r"^[ \t]*M669[^;\n]*?[ \t]K6(?![0-9])", re.MULTILINE)
 _COMMAND = re.compile(r"^[ \t]*(M669|M666)([^;\n]*)", re.MULTILINE)
 _WORD = re.compile(r"([A-Z])([-+.0-9:eE]+)")
 
@@ -120,11 +119,11 @@ def _number(value: float) -> str:
     return f"{round(float(value), 6 if abs(value) > 1 else 12) + 0.0:.9g}"
 
 
-def _refused(machine: Machine, found: str, expected: str) -> InputError:
+def _refused(machine: Machine, what: str, expected: str) -> InputError:
     """Error for a machine that is no Hangprinter."""
     return InputError(
         f"mechanism {machine.name!r} is no Hangprinter: a point on lines from fixed anchors",
-        found=found,
+        found=what,
         expected=expected,
     )
 
@@ -138,8 +137,8 @@ def _anchors(machine: Machine) -> Array:
         joint = leg.base.joint
         thin = joint in ("spherical", "universal") and layout.rod_reads[j - 1]
         if not (thin or (joint == "spool" and leg.base.radius is None)):
-            found = f"leg {j} on a {joint}" + (" with a pulley" if joint == "spool" else "")
-            raise _refused(machine, found, "lines through small eyes, read as lengths or at spools")
+            drive = f"leg {j} on a {joint}" + (" with a pulley" if joint == "spool" else "")
+            raise _refused(machine, drive, "lines through small eyes, read as lengths or at spools")
         if leg.platform.joint not in ("spherical", "universal"):
             raise _refused(machine, f"leg {j} on a {leg.platform.joint}", "joint: spherical")
     if len({leg.base.joint == "spool" for leg in document.legs}) > 1 or layout.shares_motors:
@@ -194,19 +193,24 @@ def _spools(machine: Machine) -> dict[str, Array]:
 # Reading
 
 
+def is_hangprinter(text: str) -> bool:
+    """Whether a configuration makes RepRapFirmware a Hangprinter."""
+    return _K6.search(text) is not None
+
+
 def hangprinter_words(text: str, label: str) -> dict[str, Array]:
     """Anchors (n, 3) mm under ``anchors``, and M666's values (n,) by letter.
 
     Raises InputError for a configuration without anchors or with values that are no numbers.
     """
-    found: dict[str, tuple[str, str]] = {}
+    given: dict[str, tuple[str, str]] = {}
     for match in _COMMAND.finditer(text):
         where = f"{label}, line {text.count(chr(10), 0, match.start(1)) + 1}"
         for letter, values in _WORD.findall(match.group(2)):
-            found[match.group(1) + letter] = values, where
+            given[match.group(1) + letter] = values, where
 
     def numbers(name: str, *sizes: int) -> Array:
-        values, where = found[name]
+        values, where = given[name]
         try:
             out = np.array([float(x) for x in values.split(":")])
         except ValueError:
@@ -220,7 +224,7 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
             )
         return out
 
-    letters = [c for c in ANCHOR_LETTERS if f"M669{c}" in found]
+    letters = [c for c in ANCHOR_LETTERS if f"M669{c}" in given]
     if "".join(letters) != ANCHOR_LETTERS[: len(letters)] or len(letters) < FEWEST_ANCHORS:
         raise InputError(
             "M669 K6 does not give the anchors",
@@ -232,9 +236,9 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
     anchors = [numbers(f"M669{c}", 3, 1) if c == "D" else numbers(f"M669{c}", 3) for c in letters]
     n = len(letters)
     out = {"anchors": np.array([a if len(a) == 3 else [0.0, 0.0, a[0]] for a in anchors])}
-    if "M666R" not in found:
+    if "M666R" not in given:
         return out
-    if missing := [c for c in (*SPOOL_LETTERS, "Q") if f"M666{c}" not in found]:
+    if missing := [c for c in (*SPOOL_LETTERS, "Q") if f"M666{c}" not in given]:
         raise InputError(
             "M666 does not describe the spools",
             where=label,
@@ -246,7 +250,7 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
         out[letter] = numbers(name, n)
         if not (out[letter] > 0).all():
             raise InputError(
-                f"M666 {letter} is not positive", where=found[name][1], expected="above zero"
+                f"M666 {letter} is not positive", where=given[name][1], expected="above zero"
             )
     out["Q"] = numbers("M666Q", 1)
     return out

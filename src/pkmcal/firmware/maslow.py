@@ -18,21 +18,25 @@ from pkmcal.files import csv_text, quoted, read_text
 from pkmcal.mechanisms import catalogue
 from pkmcal.starter import session_texts
 
-FROM_MASLOW = re.compile(r"CLBM:\[")
-"""Start of the belts' lengths in a log."""
 BELTS = ("bl", "br", "tr", "tl")
 """Belts in the order of the built-in machine's legs."""
 SUGGESTED_BELT_NOISE = "1 mm"
 LARGEST_FRAME = 20.0
 """Longest belt and largest coordinate of an anchor, m."""
 FEWEST_BELT_POSITIONS = 4
+_START = re.compile(r"CLBM:\[")
 _POSITION = re.compile(r"\{([^{}\n]*)\}")
 _LENGTH = re.compile(r"\b(bl|br|tr|tl)[ \t]*:[ \t]*([-+.0-9eE]+)")
 _ANCHOR = re.compile(r"Maslow_(tlX|tlY|trX|trY|brX)[ \t]*[=:][ \t]*([-+.0-9eE]+)")
-_CENTER = re.compile(r"base: \{joint: revolute, center: \[[^\]]*\]\}")
+_CENTER = re.compile(r"base: \{joint: revolute, center: \[[^\[\]]*\]\}")
 _HOME = re.compile(r"^home: .*$", re.MULTILINE)
-_RANGE = re.compile(r"range: \[[^\]]*\]")
+_RANGE = re.compile(r"range: \[[^\[\]]*\]")
 _NOISE = re.compile(r"^  noise: .*$", re.MULTILINE)
+
+
+def is_maslow_log(text: str) -> bool:
+    """Whether a text has belts' lengths as a Maslow 4 prints them."""
+    return _START.search(text) is not None
 
 
 def maslow_session_texts(text: str, label: str) -> dict[str, str]:
@@ -65,7 +69,7 @@ def belt_lengths(text: str, label: str) -> Array:
     """
     out: dict[tuple[float, ...], None] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        start = FROM_MASLOW.search(line)
+        start = _START.search(line)
         for position in _POSITION.findall(line[start.end() :] if start else ""):
             given = dict(_LENGTH.findall(position))
             values = [_number(given.get(belt, "")) for belt in BELTS]

@@ -95,7 +95,9 @@ def base_ends(layout: LimbLayout, theta: Array, readings: Array) -> BaseEnds:
     return BaseEnds(a, by_value * scale[..., None], length, rate)
 
 
-def departed(layout: LimbLayout, theta: Array, base: BaseEnds, platform: PlatformEnds) -> BaseEnds:
+def at_tangents(
+    layout: LimbLayout, theta: Array, base: BaseEnds, platform: PlatformEnds
+) -> BaseEnds:
     """Base side with the ends A of cables where their free parts begin, and the lengths of these
     parts.
     """
@@ -105,7 +107,7 @@ def departed(layout: LimbLayout, theta: Array, base: BaseEnds, platform: Platfor
     a, length = np.array(np.broadcast_to(base.a, shape)), base.length
     length = np.array(np.broadcast_to(length, np.broadcast_shapes(length.shape, shape[:-1])))
     for g in layout.windings:
-        a[..., g.legs, :], wound = g.carrier.departure(g.of(theta), platform.b[..., g.legs, :])
+        a[..., g.legs, :], wound = g.carrier.tangent_point(g.of(theta), platform.b[..., g.legs, :])
         length[..., g.legs] -= wound
     return base._replace(a=a, length=length)
 
@@ -348,7 +350,7 @@ class LimbEnds:
         layout = self.layout
         out = np.zeros((*self.b.shape, 3))
         for g in layout.windings:
-            by = g.carrier.departure_by_b(g.of(self.theta), self.b[..., g.legs, :])
+            by = g.carrier.tangent_by_b(g.of(self.theta), self.b[..., g.legs, :])
             out[..., g.legs, :, :] = by
         return out
 
@@ -379,7 +381,7 @@ class LimbEnds:
         them, by the carriers' parameters.
         """
         at = self.b[..., group.legs, :]
-        return group.carrier.departure_by_parameters(group.of(self.theta), at)
+        return group.carrier.tangent_by_parameters(group.of(self.theta), at)
 
     @cached_property
     def b_by(self) -> Array:
@@ -485,7 +487,7 @@ def limb_ends(
     internal : (..., n) internal coordinates of the poses, zero by default.
     """
     platform = platform_ends(layout, theta, poses, internal)
-    base = departed(layout, theta, base_ends(layout, theta, readings), platform)
+    base = at_tangents(layout, theta, base_ends(layout, theta, readings), platform)
     return LimbEnds(layout, theta, readings, poses, internal, base, platform)
 
 
@@ -515,7 +517,7 @@ def closure(
     internal : (..., n) internal coordinates of the poses, zero by default.
     """
     platform = platform_ends(layout, theta, poses, internal)
-    base = departed(layout, theta, base_ends(layout, theta, readings), platform)
+    base = at_tangents(layout, theta, base_ends(layout, theta, readings), platform)
     rows = rows_between(layout, theta, base, platform, poses)
     return Closure(layout, theta, readings, poses, internal, base, platform, rows)
 

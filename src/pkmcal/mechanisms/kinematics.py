@@ -29,10 +29,10 @@ from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms.closure import (
     BaseEnds,
     Closure,
+    at_tangents,
     base_ends,
     by_own,
     closure,
-    departed,
     limb_lines,
     platform_ends,
     platform_parameters,
@@ -205,7 +205,7 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
 def _state_at(task: _Task, poses: Array, internal: Array) -> _State:
     """State of the rows at poses (n, 4, 4) and internal coordinates."""
     platform = platform_ends(task.layout, task.theta, poses, internal, task.platform)
-    base = departed(task.layout, task.theta, task.base, platform)
+    base = at_tangents(task.layout, task.theta, task.base, platform)
     rows = rows_between(task.layout, task.theta, base, platform, poses)
     cost = (rows.value * rows.value).sum(axis=-1)
     worst = np.maximum.reduce(np.abs(rows.value), axis=-1, initial=0.0)
@@ -336,7 +336,7 @@ def _leg_readings(
     """
     platform = platform_ends(layout, theta, poses, internal)
     at_zero = base_ends(layout, theta, np.zeros(layout.n_readings))
-    at_zero = departed(layout, theta, at_zero, platform)
+    at_zero = at_tangents(layout, theta, at_zero, platform)
     distance = limb_lines(at_zero, platform)[1]
     # A rod on a fixed centre is linear in its reading.
     out, scale = np.where(layout.rod_reads, distance - at_zero.length, 0.0), scales(layout, theta)

@@ -337,7 +337,7 @@ class Winding(ABC):
 
     @staticmethod
     @abstractmethod
-    def departure(parameters: Array, point_b: Array) -> tuple[Array, Array]:
+    def tangent_point(parameters: Array, point_b: Array) -> tuple[Array, Array]:
         """Point A (..., 3) and the length (...,) of the cable from the carrier's place to it, m.
 
         parameters : (..., n). point_b : (..., 3). NaN where the cable cannot reach B.
@@ -345,12 +345,12 @@ class Winding(ABC):
 
     @staticmethod
     @abstractmethod
-    def departure_by_b(parameters: Array, point_b: Array) -> Array:
+    def tangent_by_b(parameters: Array, point_b: Array) -> Array:
         """Derivative (..., 3, 3) of A by B."""
 
     @classmethod
     @abstractmethod
-    def departure_by_parameters(cls, parameters: Array, point_b: Array) -> tuple[Array, Array]:
+    def tangent_by_parameters(cls, parameters: Array, point_b: Array) -> tuple[Array, Array]:
         """Derivatives (..., 3, n) of A and (..., n) of the length up to A, at a fixed B."""
 
     @staticmethod

@@ -129,7 +129,7 @@ class OverPulley(Winding):
         return center, np.zeros_like(center)
 
     @staticmethod
-    def departure(parameters: Array, point_b: Array) -> tuple[Array, Array]:
+    def tangent_point(parameters: Array, point_b: Array) -> tuple[Array, Array]:
         """P and the length on the pulley."""
         c = _over(parameters, point_b)
         radial, axial = c.r * (1 - c.cosine), c.r * c.sine
@@ -137,7 +137,7 @@ class OverPulley(Winding):
         return point, c.r * c.t
 
     @staticmethod
-    def departure_by_b(parameters: Array, point_b: Array) -> Array:
+    def tangent_by_b(parameters: Array, point_b: Array) -> Array:
         """P rolls along the cable, and swivels about the axis."""
         c = _over(parameters, point_b)
         lateral, normal = cross(c.s, c.e), c.e * c.cosine[..., None] - c.s * c.sine[..., None]
@@ -146,13 +146,13 @@ class OverPulley(Winding):
         return swivel * _outer(lateral, lateral) + roll * _outer(c.u, normal)
 
     @classmethod
-    def departure_by_parameters(cls, parameters: Array, point_b: Array) -> tuple[Array, Array]:
+    def tangent_by_parameters(cls, parameters: Array, point_b: Array) -> tuple[Array, Array]:
         """By the pulley's radius, the length changes by ``t - sin t``, by its centre by ``-u``."""
         c = _over(parameters, point_b)
         shape = np.broadcast_shapes(parameters.shape[:-1], point_b.shape[:-1])
         point = np.zeros((*shape, 3, parameters.shape[-1]))
         total = np.zeros((*shape, parameters.shape[-1]))
-        by_b = cls.departure_by_b(parameters, point_b)
+        by_b = cls.tangent_by_b(parameters, point_b)
         # centre
         point[..., :3], total[..., :3] = np.eye(3) - by_b, -c.u
         # radius
@@ -249,7 +249,7 @@ class Spool(OverPulley, BaseCarrier):
         """Closed-form readings: ``phi = 2 x / (R + sqrt(R^2 - k x))`` for x paid out."""
         del near
         spool, gear, lines, buildup = (parameters[..., k] for k in range(7, 11))
-        line = point_b - cls.departure(parameters, point_b)[0]
+        line = point_b - cls.tangent_point(parameters, point_b)[0]
         paid = lines * (np.sqrt(dot(line, line)) - length)
         square = spool**2 - buildup * paid
         root = np.sqrt(np.where(square > 0, square, np.nan))
