@@ -9,12 +9,17 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.errors import InputError
 from pkmcal.files import parse_yaml, yaml_text
 from pkmcal.geometry.rigid import perturb, pose, rotation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.pulley import Pulley, Spool
 from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.studies.calibrations import SimulatedCalibrations
+from pkmcal.studies.capture import Design
+from pkmcal.studies.tasks import Batch
+from test_identify_residuals import check
 
 CORNERS = np.array(
     [[x, y, z] for z in (2.0, -2.0) for x, y in ((3, 2), (3, -2), (-3, -2), (-3, 2))]
@@ -200,3 +205,20 @@ def test_cables_that_are_no_cables(tmp_path, kind, change, field):
     with pytest.raises(InputError) as error:
         load_mechanism(tmp_path / "x.yaml")
     assert field in str(error.value.where)
+
+
+@pytest.mark.parametrize("kind", ["pulley", "spool over pulley"])
+def test_derivatives_of_the_edges_of_cables(tmp_path, kind):
+    """The point that a cable leaves moves with the platform, and the edge with it."""
+    camera = Pinhole((1280, 960), np.array([900.0, 900.0, 639.5, 479.5, 0, 0, 0, 0, 0]))
+    design = Design(cables(tmp_path, kind), (camera,), stations=2, configurations=4)
+    data = SimulatedCalibrations(design).draw(Batch("machine", 2, np.random.SeedSequence(0)))
+    problem, rng = data.assembled.problem, np.random.default_rng(3)
+    check(problem, problem.retract(data.start, *small_steps(problem, data.start, rng)), rng)
+
+
+def small_steps(problem, state, rng):
+    linear = problem.linearize(state)
+    own = linear.by_own.shape[:2] + linear.by_own.shape[-1:]
+    shape = (state.z.shape[0], problem.unknowns.count)
+    return 0.001 * rng.normal(size=shape), 0.001 * rng.normal(size=own)
