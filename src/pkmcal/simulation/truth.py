@@ -23,7 +23,7 @@ from pkmcal.files import read_text
 from pkmcal.measurements.effects import FOCAL_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import driven_towards
-from pkmcal.placement.configurations import draw_configurations, platform_unfolded
+from pkmcal.placement.configurations import draw_configurations, platform_unfolded, same_mode
 from pkmcal.placement.stations import (
     StationPose,
     default_stations,
@@ -245,6 +245,7 @@ def _configurations(
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
     by_nominal = nominal.forward_result(joints)
     reached = by_nominal.converged & platform_unfolded(nominal, by_nominal.T_base_platform)
+    reached &= same_mode(by_nominal.T_base_platform, poses)
     poses, joints = poses[reached], joints[reached]
     in_view = np.stack(
         [
