@@ -84,8 +84,15 @@ def machine_view(
     """View of a machine whose given legs are seen by a camera; by default all legs with tubes.
 
     Each leg is seen by its tube with the longest visible length at home. Raises InputError for a
-    leg that does not exist, is repeated or has no tube.
+    leg that does not exist, is repeated or has no tube, and for cables over pulleys.
     """
+    if machine.layout.windings:
+        raise InputError(
+            what=f"control by the legs of {machine.name!r} takes rods, of which the whole length is"
+            " seen",
+            found="cables on pulleys or spools",
+            expected="joints other than pulley and spool",
+        )
     tubed = [j for j, leg in enumerate(machine.document.legs) if leg.tubes]
     wanted = np.array(tubed if legs is None else legs, dtype=int)
     missing = sorted({int(j) + 1 for j in wanted} - {j + 1 for j in tubed})
