@@ -129,8 +129,8 @@ def _candidates(
     if machine.layout.overdetermined:
         # the nearest poses may be beyond the ranges, or in an assembly mode that is not home's
         finite &= ~((joints < ranges[:, 0]) | (joints > ranges[:, 1])).any(axis=-1)
-        closed = machine.forward_result(np.where(finite[:, None], joints, 0.0))
-        finite &= same_mode(closed.T_base_platform, poses)
+        poses, joints = poses[finite], joints[finite]
+        finite = same_mode(machine.forward_result(joints).T_base_platform, poses)
     return poses[finite], joints[finite]
 
 
