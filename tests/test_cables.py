@@ -12,10 +12,12 @@ from scipy.optimize import brentq
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.errors import InputError
 from pkmcal.files import parse_yaml, yaml_text
-from pkmcal.geometry.rigid import perturb, pose, rotation
+from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.pulley import Pulley, Spool
 from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.simulation.truth import true_machine
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
 from pkmcal.studies.tasks import Batch
@@ -222,3 +224,28 @@ def small_steps(problem, state, rng):
     own = linear.by_own.shape[:2] + linear.by_own.shape[-1:]
     shape = (state.z.shape[0], problem.unknowns.count)
     return 0.001 * rng.normal(size=shape), 0.001 * rng.normal(size=own)
+
+
+def test_true_machines_of_a_study_close_at_their_readings(tmp_path):
+    """Eight cables for six freedoms: readings of the nominal model would not close theirs."""
+    camera = Pinhole((1280, 960), np.array([900.0, 900.0, 639.5, 479.5, 0, 0, 0, 0, 0]))
+    design = Design(cables(tmp_path, "pulley"), (camera,), stations=2, configurations=4)
+    data = SimulatedCalibrations(design).draw(Batch("machine", 3, np.random.SeedSequence(1)))
+    joints = data.assembled.problem.data.joints
+    layout = data.capture.machine.layout
+    rows = closure(layout, data.theta[:, None], joints, data.poses)
+    assert np.abs(rows.rows.value).max() < 6 * design.reading_noise
+
+
+def test_the_nominal_model_takes_readings_in_the_true_machines_mode(tmp_path):
+    rng = np.random.default_rng(5)
+    nominal = cables(tmp_path, "pulley")
+    turns = []
+    for _ in range(3):
+        truth = true_machine(nominal, 1.0, rng)
+        poses, joints = draw_configurations(truth, 40, 0.0, rng)
+        fk = nominal.forward_result(joints)
+        off = pose_difference(fk.T_base_platform, poses)[:, :3]
+        turns.append(np.rad2deg(np.linalg.norm(off, axis=1)))
+    # centimetres at the joints turn the platform by degrees; another mode is tens of degrees off
+    assert np.mean(np.concatenate(turns) > 35) < 0.05

@@ -84,3 +84,10 @@ def test_a_log_without_anchors_takes_the_usual_frame(tmp_path):
 def test_logs_that_are_none(tmp_path, text):
     with pytest.raises(InputError):
         written(tmp_path, text)
+
+
+def test_a_check_of_readings_alone_names_no_images(tmp_path):
+    written(tmp_path, log()).save(tmp_path / "session")
+    checked = pkmcal.check(tmp_path / "session")
+    assert "image" not in checked.outcome.subject
+    assert "36 configurations" in checked.outcome.subject
