@@ -79,8 +79,6 @@ class KinematicsOptions:
     # Gauss-Newton steps to the least-squares pose of an overdetermined machine; each multiplies the
     # remaining distance by the ratio of the closure error to a rod
     levelling_steps: int = 3
-    # Gauss-Newton steps to the position of an overdetermined machine, before its rotation is free
-    shifting_steps: int = 6
     # closure error, as a share of a rod, above which readings belong to another machine, not to
     # this one with errors
     other_machine_gap: float = 0.05
@@ -398,12 +396,13 @@ def forward(
         return whole.reshape(count, *tail)
 
     n = layout.n_internal
-    own = theta if theta.ndim == 1 else rows(theta, theta.shape[-1])
-    wanted, begin = rows(readings, layout.n_readings), rows(start, 4, 4)
-    phi = rows(np.zeros(n) if internal is None else internal, n)
-    if layout.overdetermined and layout.motion[:3].any():
-        begin = _shifted_start(layout, own, wanted, begin, phi)
-    fk = close(layout, own, wanted, begin, phi)
+    fk = close(
+        layout,
+        theta if theta.ndim == 1 else rows(theta, theta.shape[-1]),
+        rows(readings, layout.n_readings),
+        rows(start, 4, 4),
+        rows(np.zeros(n) if internal is None else internal, n),
+    )
     poses, inner = fk.poses.reshape(*shape, 4, 4), fk.internal.reshape(*shape, n)
     error = fk.error.reshape(shape)
     converged = error < CONVERGED_CLOSURE_ERROR
@@ -432,24 +431,6 @@ def driven_towards(
         return fk
     exact = on_manifold(layout, theta, fk.T_base_platform)
     return replace(exact, converged=exact.converged & fk.converged)
-
-
-def _shifted_start(
-    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
-) -> Array:
-    """Starts (N, 4, 4) shifted, without rotation, to where an overdetermined machine's rods miss
-    least.
-
-    Many rods meet nearly at several rotations. From a start far away all six freedoms may turn the
-    platform into another of them; the position alone has one minimum.
-    """
-    shifts = layout.motion[:, ~layout.motion[:3].any(axis=0)]
-    for _ in range(KINEMATICS.shifting_steps):
-        c = closure(layout, theta, readings, poses, internal)
-        back = np.linalg.pinv(np.nan_to_num(c.rows.by_pose @ shifts))
-        step = (back @ np.nan_to_num(c.rows.value)[..., None])[..., 0] @ shifts.T
-        poses = perturb(poses, -step)
-    return poses
 
 
 def _least_squares_poses(

@@ -129,14 +129,16 @@ def _candidates(
     if machine.layout.overdetermined:
         # the nearest poses may be beyond the ranges, or in an assembly mode that is not home's
         finite &= ~((joints < ranges[:, 0]) | (joints > ranges[:, 1])).any(axis=-1)
+        # the nearest pose to random lengths may be turned so far that cables would cross
+        finite &= same_mode(poses, machine.home())
         poses, joints = poses[finite], joints[finite]
         finite = same_mode(machine.forward_result(joints).T_base_platform, poses)
     return poses[finite], joints[finite]
 
 
 def same_mode(T_base_platform: Array, near: Array) -> Booleans:
-    """(n,) True where two poses (n, 4, 4) at equal readings are of one assembly mode, as those of
-    a machine and its nominal model.
+    """(n,) True where two poses (n, 4, 4) are turned to each other by less than another assembly
+    mode of a machine with extra rods would be.
     """
     turn = np.linalg.norm(pose_difference(T_base_platform, near)[..., :3], axis=-1)
     return np.asarray(turn < FARTHEST_TILT)
