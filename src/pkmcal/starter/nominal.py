@@ -123,6 +123,7 @@ class NominalModel:
     heading : paragraphs of the file's first comment. numbers : lines of a comment for each number
     that it is made of. home : (3,) position of the platform, m, without rotation. tube_radius : of
     every leg's cylinder, None for legs without. assumed : names of numbers that were not given.
+    sigma : standard deviation of the numbers, m; None for that of a ruler.
     """
 
     name: str
@@ -133,6 +134,7 @@ class NominalModel:
     home: Array
     tube_radius: float | None = None
     assumed: tuple[str, ...] = ()
+    sigma: float | None = None
 
     __repr__ = short_repr
 
@@ -142,7 +144,9 @@ class NominalModel:
         for first, *rest in self.numbers:
             lines += ["", first, *(f"  {line}" for line in rest)]
         comment = "\n".join(f"# {line}".rstrip() for line in lines)
-        sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
+        sigma = self.sigma
+        if sigma is None:
+            sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
         return (
             f"{comment}\nname: {self.name}\nmotion: {self.motion}\n\n"
             "# Base joints in the base frame, platform joints in the platform frame, which has the"
