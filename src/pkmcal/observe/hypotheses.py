@@ -92,7 +92,8 @@ class ImageEvidenceOptions:
     # machine of equal parts looks the same from each. The refusal names the pose as a rival
     pose_by_hand: float = 1000.0
     # share of the mean log-likelihood ratio of a localized machine's images by which another name
-    # has to be likelier, or another numbering of its legs: between two nearly equal configurations,
+    # has to be likelier, another numbering of its legs, or any mistake if a second search localizes
+    # the machine as stated: between two nearly equal configurations,
     # and between equal parts of a machine, errors of the nominal model decide, of which the
     # likelihood contains the scatter but not that all images of a station share them. Their effect
     # grows with the evidence, so it is a share and no number of nats. On simulated machines,
@@ -316,10 +317,9 @@ def _likelier(
     session, if any, with the rivals that it does not exclude.
 
     count : number of explanations of which these are the likeliest; of these, if None. Chance may
-    confirm any of them, so the p-value of each is multiplied by their number (Bonferroni). It then
-    has to be below the limit, and, if the same search confirms the session as stated, no larger
-    than its p-value. The constants of a reversed motor are one explanation, as in the prior odds:
-    those near each other show nearly the same legs.
+    confirm any of them, so the p-value of each is multiplied by their number (Bonferroni). The
+    constants of a reversed motor are one explanation, as in the prior odds: those near each other
+    show nearly the same legs.
     """
     if not hypotheses:
         return None
@@ -333,17 +333,20 @@ def _likelier(
         )
         poses = np.stack([f.T_camera_base for f in (localization, own, *searched)])
         stated = likelihood_from(view, poses)
-        limit = min(own.limit, own.p_value) if own.good else own.limit
+        # a machine that only this search localizes was missed, rather than described wrongly
+        missed = own.good and not localization.good
+        margin = options.right_name_share * own.log_likelihood_ratio if missed else 0.0
         out = np.full(len(hypotheses), -np.inf)
         for k, (h, other, at) in enumerate(zip(hypotheses, views, searched, strict=True)):
             if not at.good or station._replace(localization=at).elsewhere:
                 continue
-            ratio = (likelihood_from(other, poses) - stated) / localization.correlation_length
+            gain = likelihood_from(other, poses) - stated - margin
+            ratio = gain / localization.correlation_length
             # the stated readings contradict the pose by hand, and no other station shows that they
             # are in order
             if station.elsewhere and localization.good and not in_order and h.readings is not None:
                 out[k] = ratio + options.pose_by_hand
-            elif at.p_value * count <= limit:
+            elif at.p_value * count < at.limit:
                 out[k] = ratio
         return out
 
