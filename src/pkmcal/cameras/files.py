@@ -208,7 +208,7 @@ coefficients are zero."""
 _KALIBR = {
     ("pinhole", "radtan"): "pinhole",
     ("pinhole", "none"): "pinhole",
-    ("pinhole", "equi"): "fisheye",
+    ("pinhole", "equidistant"): "fisheye",
     ("omni", "radtan"): "unified",
     ("omni", "none"): "unified",
     ("ds", "none"): "double_sphere",
@@ -217,7 +217,7 @@ _KALIBR = {
 """Camera models by Kalibr's camera and distortion model."""
 _KALIBR_NAMES = {
     "pinhole": ("pinhole", "radtan"),
-    "fisheye": ("pinhole", "equi"),
+    "fisheye": ("pinhole", "equidistant"),
     "unified": ("omni", "radtan"),
     "double_sphere": ("ds", "none"),
     "extended_unified": ("eucm", "none"),
