@@ -10,8 +10,8 @@ with the verdicts of the last run. Files are taken by their names:
 - printer: configuration of a firmware. Where it or a height map in its folder has probed points,
   the session of these is checked and calibrated.
 - camera: file of ROS, Kalibr, OpenCV, mrcal, COLMAP or ViSP.
-- board: folder of images with a ``board.yaml``, written by hand after the owner's description, and
-  ``files.txt`` with further names of images to use; its camera is calibrated.
+- board: folder of images with a ``board.yaml``, written by hand after the owner's description; its
+  camera is calibrated.
 
 Printed: verdict, codes of the findings or the refusal, and seconds of each file; then the number of
 files of each kind and verdict, the files of each code, and what differs from ``public.csv``. A
@@ -27,7 +27,7 @@ import csv
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,8 +38,14 @@ from pkmcal.firmware.session import write_printer_session
 
 LEDGER = Path(__file__).with_name("public.csv")
 IMAGES = {".png", ".jpg", ".jpeg"}
-CAMERA_NAMES = ("*.cameramodel", "*camera*.xml", "cameras.txt", "*.yaml")
-PRINTER_NAMES = ("*.cfg", "*.g", "Configuration*.h", "config")
+CAMERA_NAMES = (
+    "*.cameramodel", "*camera*.xml", "cameras.txt", "ost.yaml", "*camera_info.yaml",
+    "*chain.yaml",
+)  # fmt: skip
+PRINTER_NAMES = (
+    "printer*.cfg", "*delta*.cfg", "*kossel*.cfg", "config.g", "Configuration.h", "config",
+)  # fmt: skip
+COLUMNS = "file", "kind", "verdict", "codes", "right"
 
 
 class Row(NamedTuple):
@@ -99,6 +105,15 @@ def kind_of(path: Path) -> str | None:
     return "camera" if any(path.match(name) for name in CAMERA_NAMES) else None
 
 
+def by_codes(rows: Iterable[Row]) -> Counter[tuple[str, str]]:
+    """Number of files by judgement (yes, no, or nobody's) and code, or refusal."""
+    out: Counter[tuple[str, str]] = Counter()
+    for row in rows:
+        codes = [row.codes] if row.verdict == "refused" else row.codes.split()
+        out.update((row.right or "not judged", code) for code in codes)
+    return out
+
+
 def rows_of(folder: Path, only: str) -> Iterator[tuple[Row, float]]:
     """Verdicts on the files of a folder, with their seconds."""
     for path in sorted(folder.rglob("*")):
@@ -120,10 +135,33 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of the paths of the files to read")
     parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
-    rows = []
-    for row, seconds in rows_of(args.folder, args.only):
-        print(f"{row.file}: {row.kind}, {row.verdict}, {row.codes or '-'}, {seconds:.1f} s", flush=True)
+    with LEDGER.open(encoding="utf-8", newline="") as lines:
+        before = {one["file"]: Row(**one) for one in csv.DictReader(lines)}
+    rows, changed = list[Row](), list[str]()
+    for read, seconds in rows_of(args.folder, args.only):
+        row, old = read, before.get(read.file)
+        if old is not None and old[:-1] == read[:-1]:
+            row = old
+        elif old is not None:
+            changed.append(f"{old.file}: was {old.verdict}, {old.codes or 'no finding'}")
+        print(
+            f"{row.file}: {row.kind}, {row.verdict}, {row.codes or '-'}, {seconds:.1f} s",
+            flush=True,
+        )
         rows.append(row)
+    print("\nfiles by kind and verdict")
+    for (kind, verdict), number in sorted(Counter((r.kind, r.verdict) for r in rows).items()):
+        print(f"{number:5} {kind}, {verdict}")
+    print("\nfiles by judgement and finding")
+    for (right, code), number in sorted(by_codes(rows).items()):
+        print(f"{number:5} {right:11} {code}")
+    print(f"\nfalse alarms: {sum(r.right == 'no' for r in rows)} of {len(rows)} files")
+    print("changed:", *(changed or ["none"]), sep="\n  ")
+    if args.write:
+        others = [row for name, row in before.items() if name not in {r.file for r in rows}]
+        with LEDGER.open("w", encoding="utf-8", newline="") as out:
+            writer = csv.writer(out, lineterminator="\n")
+            writer.writerows([COLUMNS, *sorted([*others, *rows])])
 
 
 if __name__ == "__main__":

@@ -281,9 +281,8 @@ def _starts_near(
     """A pose (4, 4), and random ones around it: rotated about the middle of the machine, and
     shifted; (near_starts, 4, 4).
     """
-    k = view.configuration[0]
     ends = view.machine.ends_at(view.joints, view.poses)
-    middle = np.concatenate([ends.a[k], ends.b[k]]).mean(axis=0)
+    middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
     turn = rotation(rng.normal(size=(options.near_starts, 3)) * options.near_turn)
     turn[0] = np.eye(3)
     starts = T_camera_base @ pose(turn, middle - turn @ middle)

@@ -102,12 +102,20 @@ def _from_one_image(
         return best.T_camera_base[0], True, text
     if start is not None and near.rival_probability < LOCALIZATION_OPTIONS.rival:
         # one image has edges enough for a machine elsewhere; the person knows where it is
-        return near.T_camera_base[0], True, (
-            "Placed where it fits best near your place. One image does not exclude others: see"
-            " whether the lines lie on the legs."
+        return (
+            near.T_camera_base[0],
+            True,
+            (
+                "Placed where it fits best near your place. One image does not exclude others: see"
+                " whether the lines lie on the legs."
+            ),
         )
     why = f"with probability {brief(best.rival_probability)} another place is the right one"
-    return best.T_camera_base[0], False, f"Not sure: {why}. Bring it to where it is, joint by joint."
+    return (
+        best.T_camera_base[0],
+        False,
+        f"Not sure: {why}. Bring it to where it is, joint by joint.",
+    )
 
 
 def _search_view(content: SessionContent, s: int) -> StationView:
