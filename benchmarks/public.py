@@ -63,7 +63,8 @@ class Row(NamedTuple):
 
 
 def camera(path: Path) -> tuple[str, str]:
-    pkmcal.load_camera(path)
+    """Of the only camera, or the first one of Kalibr's several."""
+    pkmcal.load_camera(path.with_name(f"{path.name}#cam0") if path.match("*chain.yaml") else path)
     return "read", ""
 
 

@@ -236,7 +236,7 @@ def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
     try:
         lines = session.read_text("utf-8").splitlines() if session.is_file() else []
     except (OSError, UnicodeDecodeError):
-        lines = []
+        lines = list[str]()
     entries = "\n".join(line.partition("#")[0] for line in lines)
     return tuple(
         doubtful("session.example_file", name, what=what)
