@@ -292,7 +292,7 @@ def _nominal(
 
 
 def _file_model(path: Path, unit: str | None, dimensions: Mapping[str, float]) -> NominalModel:
-    """Nominal model of a printer's configuration, which needs no dimensions, or of joint centres."""
+    """Nominal model of a printer's configuration, which has all dimensions, or of centres."""
     text = read_text(path)
     if is_hangprinter(text):
         whole, model = "a Hangprinter's configuration", partial(hangprinter_model, text, path.name)
