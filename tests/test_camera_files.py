@@ -92,7 +92,7 @@ cam0:
 cam1:
   camera_model: pinhole
   intrinsics: [500, 501, 320, 240]
-  distortion_model: equi
+  distortion_model: equidistant
   distortion_coeffs: [0.1, 0.2, 0.003, 0.004]
   T_cn_cnm1:
   - [1, 0, 0, 0.1]

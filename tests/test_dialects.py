@@ -166,3 +166,19 @@ def test_what_these_firmwares_have_not_is_refused(text, tmp_path):
     with pytest.raises(InputError) as caught:
         read_printer(text_file(tmp_path, text))
     assert WRONG[text] in str(caught.value)
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_values_that_config_g_loads_count_where_their_file_is_beside_it(tmp_path, beside):
+    """RepRapFirmware's M501 loads config-override.g in place; a later M665 counts more."""
+    own, saved = "M665 R100 L250 H300\nM666 X1 Y0 Z0\n", "M665 R104 L252 H301\n"
+    (tmp_path / "config.g").write_text(f"{own}M501\n")
+    if beside:
+        (tmp_path / "config-override.g").write_text(saved)
+    printer = read_printer(tmp_path / "config.g")
+    assert (printer.radius, printer.rod.tolist()) == (
+        (104, [252] * 3) if beside else (100, [250] * 3)
+    )
+    assert len(printer.remarks) == 1
+    (tmp_path / "config.g").write_text(f"M501\n{own}")
+    assert read_printer(tmp_path / "config.g").radius == 100

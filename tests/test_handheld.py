@@ -47,6 +47,7 @@ from pkmcal.observe.image_localization import (
     PoseHypotheses,
     finest_view,
     localize_image,
+    localize_near,
     symmetric_poses,
 )
 from pkmcal.observe.images import decode
@@ -777,6 +778,18 @@ def test_one_image_is_found_from_nothing(searched):
     value = localize_image(view, p.images[0])
     off = pose_difference(value.T_camera_base[0], truth.T_camera_base[k])
     assert value.rival_probability < LOCALIZATION_OPTIONS.rival
+    assert np.degrees(np.linalg.norm(off[:3])) < 4
+    assert np.linalg.norm(off[3:]) < 0.1
+
+
+@pytest.mark.parametrize("k", range(3))
+def test_one_image_is_localized_near_a_pose_by_hand(searched, k):
+    """Also where the search everywhere prefers another place."""
+    session, images, poses, truth = searched
+    rough = perturb(truth.T_camera_base[k], np.array([0.05, -0.04, 0.06, 0.03, -0.02, 0.05]))
+    view = view_of(session, images[k], poses)
+    value = localize_near(view, images[k].images[0], rough)
+    off = pose_difference(value.T_camera_base[0], truth.T_camera_base[k])
     assert np.degrees(np.linalg.norm(off[:3])) < 4
     assert np.linalg.norm(off[3:]) < 0.1
 

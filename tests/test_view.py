@@ -19,6 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 import pkmcal
@@ -47,8 +48,8 @@ from test_report_page import HOSTILE
 class Page(ServedPage):
     """A session's page, and its questions."""
 
-    def __init__(self, folder, calibration=None):
-        self.subject = SessionContent(load_session(folder), calibration)
+    def __init__(self, folder, calibration=None, fewest=2):
+        self.subject = SessionContent(load_session(folder, fewest=fewest), calibration)
         routes = session_routes(self.subject)
         self.app = serving.application(routes, TOKEN, PORT)
 
@@ -311,6 +312,30 @@ def test_every_edge_that_is_not_measured_has_its_reason(page):
     assert tips
     assert all(any(reason in text for text in visible["reasons"]) for reason in tips)
     assert len({*tips}) == len(visible["reasons"])
+
+
+def test_a_session_of_one_image_is_viewed_and_placed(session, truth):
+    """A calibration needs two; a person begins with one."""
+    first, *others = load_session(session).stations[0].images
+    for image in others:
+        image.path.unlink()
+    table = (session / "joints.csv").read_text().splitlines()
+    rows = [table[0], table[1 + first.configuration]]
+    (session / "joints.csv").write_text("\n".join(rows) + "\n")
+    document = yaml.safe_load((session / "session.yaml").read_text())
+    document["stations"] = dict([next(iter(document["stations"].items()))])
+    (session / "session.yaml").write_text(yaml.safe_dump(document))
+    with pytest.raises(InputError):
+        load_session(session)
+    opened = Page(session, fewest=1)
+    true = truth.T_camera_base[0]
+    rough = perturb(true, np.array([0.03, -0.04, 0.05, 0.03, -0.02, 0.05]))
+    value = opened.ask("localize", pose=rough.tolist())
+    assert value["localized"]
+    angle, distance = off(value["overlay"]["pose"], true)
+    assert angle < 1.5
+    assert distance < 25
+    assert pkmcal.view(session).document["kind"] == "session"
 
 
 def test_the_machine_is_found_from_nowhere(page, truth):

@@ -52,7 +52,7 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     """
     path, camera = camera_path(path)
     label = label.removesuffix(f"#{camera}") if label else path.name
-    text = read_text(path, label, LARGEST_WRITTEN_FILE)
+    text = _text_of(path, label)
     if is_visp(text):
         return _from_intrinsics(read_visp(text, label, camera))
     if is_mrcal(text) and camera is not None:
@@ -78,7 +78,7 @@ def is_camera_file(path: Path | str) -> bool:
     path, _ = camera_path(path)
     if not path.is_file():
         return False
-    text = read_text(path, path.name, LARGEST_WRITTEN_FILE)
+    text = _text_of(path, path.name)
     if any(one(text) for one in (is_visp, is_mrcal, is_colmap)) or _is_opencv(text):
         return True
     if path.suffix not in (".yaml", ".yml"):
@@ -86,6 +86,16 @@ def is_camera_file(path: Path | str) -> bool:
     data = parse_yaml(text, path, path.name).data
     own = data.get("model") in camera_models()
     return own or "camera_matrix" in data or bool(_kalibr_names(data))
+
+
+def _text_of(path: Path, label: str) -> str:
+    """Text of a camera file; OpenCV's first line, no YAML, is a comment in files of Kalibr, to
+    which OpenVINS adds it.
+    """
+    text = read_text(path, label, LARGEST_WRITTEN_FILE)
+    if text.startswith("%YAML:1.0") and "opencv-matrix" not in text and "camera_model:" in text:
+        return text.replace("%", "#", 1)
+    return text
 
 
 def _is_opencv(text: str) -> bool:
@@ -198,7 +208,7 @@ coefficients are zero."""
 _KALIBR = {
     ("pinhole", "radtan"): "pinhole",
     ("pinhole", "none"): "pinhole",
-    ("pinhole", "equi"): "fisheye",
+    ("pinhole", "equidistant"): "fisheye",
     ("omni", "radtan"): "unified",
     ("omni", "none"): "unified",
     ("ds", "none"): "double_sphere",
@@ -207,7 +217,7 @@ _KALIBR = {
 """Camera models by Kalibr's camera and distortion model."""
 _KALIBR_NAMES = {
     "pinhole": ("pinhole", "radtan"),
-    "fisheye": ("pinhole", "equi"),
+    "fisheye": ("pinhole", "equidistant"),
     "unified": ("omni", "radtan"),
     "double_sphere": ("ds", "none"),
     "extended_unified": ("eucm", "none"),

@@ -38,7 +38,7 @@ from pkmcal.exporters.delta import (
     proportional_switches,
     steps_correction,
 )
-from pkmcal.files import quoted
+from pkmcal.files import quoted, read_text
 from pkmcal.firmware.contract import (
     CARRIAGE_STEP,
     LARGEST_PRINTER_VALUE,
@@ -57,8 +57,10 @@ NO_REPRAP_PRINT_RADIUS = (
     "There is no print radius, B: it stays the printer's own; where none was set it is 80 mm."
 )
 _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
-FILE_NAMES = ("config.g", "config-override.g")
-OWN_WORDS = ("RepRapFirmware", "config-override.g")
+OVERRIDE = "config-override.g"
+"""File that M500 writes, and that M501 loads."""
+FILE_NAMES = ("config.g", OVERRIDE)
+OWN_WORDS = ("RepRapFirmware", OVERRIDE)
 _OWN_COMMAND = re.compile(
     r"\s*(?:M665\b.*?[LR][\d.]+:|M666\b.*?[AB]-?[\d.]|M669 K|M584 |M569 P|M350 .*?I\d|M671 |M558 |"
     r"M307 )"
@@ -66,7 +68,7 @@ _OWN_COMMAND = re.compile(
 """Commands, or their words, that Marlin has not: M666 A and B are the bed's tilt."""
 _M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
 _PRINT_RADIUS = re.compile(r"^[^\S\n]*M665\b[^;\n]*\sB", re.MULTILINE)
-_OURS = re.compile(r"\s*M66[56]\b")
+_OURS = re.compile(r"\s*M(?:66[56]|501)\b")
 HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
 _G30 = re.compile(r"^[^\S\n]*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
 _G30_WORD = re.compile(rf"([PXY])\s*{NUMBER}", re.IGNORECASE)
@@ -103,10 +105,11 @@ class RepRap(Firmware):
     def printer(self, text: str, path: Path) -> Printer:
         """Printer of a file with M665 and M666; of repeated values the last counts.
 
+        M501 loads config-override.g, with the values of the last M500, from the same folder.
         Raises InputError for missing, malformed or impossible values.
         """
         label = path.name
-        words, places = _checked_words(text, label)
+        words, places, remarks = _checked_words(text, label, path.with_name(OVERRIDE))
         rod, radius, height = (
             _words(words, label, "665" + letter, size)
             for letter, size in (("L", 3), ("R", 1), ("H", 1))
@@ -142,6 +145,7 @@ class RepRap(Firmware):
             carriages=partial(reprap_carriage_heights, command),
             step=CARRIAGE_STEP if steps is None else float(1 / steps.min()),
             steps=steps,
+            remarks=remarks,
         )
 
     def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
@@ -277,15 +281,33 @@ def reprap_arm_angles(words: dict[str, Array], points: Array) -> Array:
 # Reading
 
 
-def _checked_words(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
-    """Values by command and letter, of M665 and M666 only, and the line of each.
+def _checked_words(
+    text: str, label: str, override: Path
+) -> tuple[dict[str, Array], dict[str, str], tuple[str, ...]]:
+    """Values by command and letter, of M665 and M666 only, the line of each, and remarks.
 
-    Raises InputError for a line that holds no numbers within bounds.
+    override : the file that M501 loads; its values count where it exists. Raises InputError for a
+    line that holds no numbers within bounds.
     """
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if _OURS.match(line)]
+    remarks: tuple[str, ...] = ()
     words: dict[str, Array] = {}
     places: dict[str, str] = {}
     for n, line in lines:
+        if line.split()[0] == "M501":
+            if label == OVERRIDE:
+                continue
+            if override.is_file():
+                saved = _checked_words(read_text(override), OVERRIDE, override)
+                words |= saved[0]
+                places |= saved[1]
+                remarks = (f"{OVERRIDE} counts, which {label} loads with M501",)
+            else:
+                remarks = (
+                    f"{label} loads {OVERRIDE} with M501, which is not beside it: copy it there,"
+                    " for its values count",
+                )
+            continue
         try:
             value = read_words(line)
         except ValueError:
@@ -300,7 +322,7 @@ def _checked_words(text: str, label: str) -> tuple[dict[str, Array], dict[str, s
             )
         words.update({name.upper(): values for name, values in value.items()})
         places.update({name.upper(): f"{label}, line {n}" for name in value})
-    return words, places
+    return words, places, remarks
 
 
 def _steps_per_mm(text: str, label: str) -> Array | None:

@@ -243,18 +243,9 @@ def refine_local(
     """
     options = IMAGE_LOCALIZATION_OPTIONS
     rng, one = np.random.default_rng(0), np.zeros(1, dtype=int)
-    ends = view.machine.ends_at(view.joints, view.poses)
-    middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
     best, most = T_camera_base, -np.inf
     for _ in range(options.near_rounds):
-        # rotations about the middle of the machine, and shifts; the first start is the best so far
-        turn = rotation(rng.normal(size=(options.near_starts, 3)) * options.near_turn)
-        turn[0] = np.eye(3)
-        starts = best @ pose(turn, middle - turn @ middle)
-        away = np.sqrt(dot(starts[0, :3, 3], starts[0, :3, 3]))
-        starts[1:, :3, 3] += (
-            away * rng.normal(size=(options.near_starts - 1, 3)) * options.near_shift
-        )
+        starts = _starts_near(view, best, rng, options)
         starts, log_likelihood_ratio = refine_ml(view, starts, one, 8, 6)
         starts = starts[np.argsort(-log_likelihood_ratio)[: options.near_refined]]
         starts, log_likelihood_ratio = refine_ml(view, starts, one, 16, 10, scatter)
@@ -262,6 +253,42 @@ def refine_local(
         if log_likelihood_ratio[k] > most:
             best, most = starts[k], float(log_likelihood_ratio[k])
     return best, most
+
+
+def localize_near(
+    view: StationView,
+    image: Integers,
+    T_camera_base: Array,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> PoseHypotheses:
+    """Pose hypotheses of the camera of one image near a pose (4, 4) by hand, best first.
+
+    view : of this image alone.
+    """
+    one = np.zeros(1, dtype=int)
+    coarse = replace(view, tables=distance_tables([image], options.tables_at(1)))
+    starts = _starts_near(view, T_camera_base, np.random.default_rng(0), options)
+    settled = refine_lm(coarse, starts, one, 4, options.next_reaches)
+    return weighed_poses(view, image, np.concatenate([starts, settled]), options)
+
+
+def _starts_near(
+    view: StationView,
+    T_camera_base: Array,
+    rng: np.random.Generator,
+    options: ImageLocalizationOptions,
+) -> Array:
+    """A pose (4, 4), and random ones around it: rotated about the middle of the machine, and
+    shifted; (near_starts, 4, 4).
+    """
+    ends = view.machine.ends_at(view.joints, view.poses)
+    middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
+    turn = rotation(rng.normal(size=(options.near_starts, 3)) * options.near_turn)
+    turn[0] = np.eye(3)
+    starts = T_camera_base @ pose(turn, middle - turn @ middle)
+    away = np.sqrt(dot(starts[0, :3, 3], starts[0, :3, 3]))
+    starts[1:, :3, 3] += away * rng.normal(size=(options.near_starts - 1, 3)) * options.near_shift
+    return starts
 
 
 def _most(view: StationView, values: Array, samples: int, count: int) -> Array:

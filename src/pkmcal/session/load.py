@@ -264,7 +264,9 @@ def session_folder(subject: str) -> Path | None:
     return None
 
 
-def load_session(folder: Path | str, model: str | None = None, *, measured: bool = True) -> Session:
+def load_session(
+    folder: Path | str, model: str | None = None, *, measured: bool = True, fewest: int = 2
+) -> Session:
     """Read and check a session.
 
     Parameters
@@ -274,8 +276,11 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     model :
         One of the models that the mechanism file names.
     measured :
-        Whether images, or poses, of at least two configurations are required. A session is
-        shown and planned for before any exist.
+        Whether images, or poses, are required. A session is shown and planned for before any
+        exist.
+    fewest :
+        Fewest configurations with images or poses, if they are required. A calibration needs two;
+        one image can be viewed.
 
     Raises
     ------
@@ -288,7 +293,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model)
     # Joint readings.
-    table, temperature, findings = _readings(folder, document, schema, machine, measured)
+    table, temperature, findings = _readings(folder, document, schema, machine, measured, fewest)
     # Board, camera stations and trackers.
     board = _board(folder, document, schema)
     findings += _unused_board(document, schema)
@@ -309,7 +314,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     _check_noise(document, schema, machine)
     _check_names(document, (*stations, *trackers))
     if measured and (schema.stations or links):
-        findings += _unmeasured(table, stations, trackers, links)
+        findings += _unmeasured(table, stations, trackers, links, fewest)
     return Session(
         folder=folder,
         machine=machine,
@@ -348,7 +353,12 @@ def load_session_to_plan(folder: Path | str) -> Session:
 
 
 def _readings(
-    folder: Path, document: Document, schema: SessionDocument, machine: Machine, measured: bool
+    folder: Path,
+    document: Document,
+    schema: SessionDocument,
+    machine: Machine,
+    measured: bool,
+    fewest: int,
 ) -> tuple[CsvTable, Array | None, list[Finding]]:
     """Table of the joint readings, temperatures (K,) where it has them, and findings on them; empty
     where none exist before a plan.
@@ -365,7 +375,7 @@ def _readings(
             no_such(machine.joint_units[0], document.data["joints"]["noise"]),
             where=document.where("joints", "noise"),
         )
-    findings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
+    findings = check_readings(table, machine.joint_ranges, noise, machine.joint_units, fewest)
     if measured and not schema.stations and not schema.links():
         _check_redundant(document, machine)
         whole, repeated = without_repeats(whole, table, noise)
@@ -773,14 +783,13 @@ def _unmeasured(
     stations: tuple[Station, ...],
     trackers: tuple[PoseTable, ...],
     links: tuple[LinkSet, ...],
+    fewest: int,
 ) -> list[Finding]:
-    """Warning about configurations without measurements; raises InputError if fewer than two have
-    any.
-    """
+    """Warning about configurations without measurements; raises InputError if too few have any."""
     measured = {image.configuration for station in stations for image in station.images}
     measured |= {int(k) for tracker in trackers for k in tracker.configuration}
     measured |= {int(k) for one in links for k in one.configuration.ravel()}
-    if len(measured) < 2:
+    if len(measured) < fewest:
         raise InputError(
             "only one configuration was measured"
             if trackers or links

@@ -56,17 +56,18 @@ def without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
 
 
 def check_readings(
-    table: CsvTable, ranges: Array, noise: float, units: Sequence[str]
+    table: CsvTable, ranges: Array, noise: float, units: Sequence[str], fewest: int = 2
 ) -> list[Finding]:
     """Raise InputError for readings that are impossible for the machine; return warnings.
 
     ranges : (m, 2) smallest and largest reading of each joint, m or rad; NaN if unknown.
     noise : standard deviation of a reading, m or rad.
     units : ``m`` or ``rad`` for each joint.
+    fewest : fewest configurations.
     """
     _check_columns(table, len(ranges))
     table.check_kinds(units)
-    if len(table.names) < 2:
+    if len(table.names) < fewest:
         raise InputError(
             "there is only one configuration",
             where=table.label,
@@ -75,7 +76,8 @@ def check_readings(
             next_step="Move the machine and take more images; 15 configurations are usual",
         )
     _check_mistakes(table, ranges, units)
-    return _check_ranges(table, ranges) + _check_movement(table, noise)
+    movement = _check_movement(table, noise) if len(table.names) > 1 else []
+    return _check_ranges(table, ranges) + movement
 
 
 def _check_columns(table: CsvTable, n_joints: int) -> None:

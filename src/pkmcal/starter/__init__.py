@@ -228,11 +228,20 @@ def _session_text(text: str, hexapod: bool, turns: bool, what: ObservedChoice, p
 
 
 def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
-    """Warnings about files of a session that are still as `pkmcal new` wrote them."""
+    """Warnings about files of a session that are still as `pkmcal new` wrote them.
+
+    Files that session.yaml does not name are not the session's.
+    """
+    session = Path(folder) / "session.yaml"
+    try:
+        lines = session.read_text("utf-8").splitlines() if session.is_file() else []
+    except (OSError, UnicodeDecodeError):
+        lines = list[str]()
+    entries = "\n".join(line.partition("#")[0] for line in lines)
     return tuple(
         doubtful("session.example_file", name, what=what)
         for name, what in TO_FILL.items()
-        if _is_untouched(Path(folder) / name, name)
+        if (name in entries or name == "session.yaml") and _is_untouched(Path(folder) / name, name)
     )
 
 

@@ -7,12 +7,12 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.image_localization import localize_image
+from pkmcal.observe.image_localization import localize_image, localize_near, weighed_poses
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, find_station
 from pkmcal.viewing.content import SessionContent
-from pkmcal.viewing.overlay import overlay_after_gesture, placed_by_hand, pose_rows
+from pkmcal.viewing.overlay import overlay_after_gesture, pane_of, placed_by_hand, pose_rows
 from pkmcal.web.session_document import LocalizationAnswer, ViewRequest
 from pkmcal.wording import brief, count
 
@@ -41,14 +41,19 @@ def localized_overlay(content: SessionContent, request: ViewRequest) -> Localiza
             found="observe: board" if "legs" not in station.observe else "legs without tubes",
             next_step="Its place is found from the board when you calibrate",
         )
-    # several images verify each other; a single one is searched globally
     start = placed_by_hand(content, request).T_camera_base
+    unplaced = station.T_camera_base is None and np.allclose(
+        start, pane_of(content, request).T_camera_base
+    )
+    near = None if request.anywhere or unplaced else start
+    # several images verify each other
     view = _search_view(content, request.station)
     many = len(view.configuration) >= FEWEST_FITTED_TOGETHER
     if many:
         localized, sure, text = _from_images(view, None if request.anywhere else start)
     else:
-        localized, sure, text = _from_one_image(view, content.image(request.station, request.image))
+        image = content.image(request.station, request.image)
+        localized, sure, text = _from_one_image(view, image, near)
     pose = localized if sure else start
     # overlay at the localized pose, without the gesture and pins that led to the start
     plain = {"pose": pose_rows(pose), "gesture": None, "pins": ()}
@@ -81,14 +86,36 @@ def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, s
     return pose.T_camera_base, pose.good, text
 
 
-def _from_one_image(view: StationView, image: Integers) -> tuple[Array, bool, str]:
-    """Localization from one image, with a global search: pose, success, and a sentence."""
-    localized = localize_image(view, image)
-    best = localized.T_camera_base[0]
-    if localized.rival_probability < LOCALIZATION_OPTIONS.rival:
-        return best, True, "Placed: from no other place does the machine fit as well."
-    why = f"with probability {brief(localized.rival_probability)} another place is the right one"
-    return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
+def _from_one_image(
+    view: StationView, image: Integers, start: Array | None
+) -> tuple[Array, bool, str]:
+    """Localization from one image, everywhere and near a start: pose, success, and a sentence."""
+    anywhere = localize_image(view, image)
+    if start is None:
+        near, best = anywhere, anywhere
+    else:
+        near = localize_near(view, image, start)
+        both = np.concatenate([near.T_camera_base, anywhere.T_camera_base])
+        best = weighed_poses(view, image, both)
+    if best.rival_probability < LOCALIZATION_OPTIONS.rival:
+        text = "Placed: from no other place does the machine fit as well."
+        return best.T_camera_base[0], True, text
+    if start is not None and near.rival_probability < LOCALIZATION_OPTIONS.rival:
+        # one image has edges enough for a machine elsewhere; the person knows where it is
+        return (
+            near.T_camera_base[0],
+            True,
+            (
+                "Placed where it fits best near your place. One image does not exclude others: see"
+                " whether the lines lie on the legs."
+            ),
+        )
+    why = f"with probability {brief(best.rival_probability)} another place is the right one"
+    return (
+        best.T_camera_base[0],
+        False,
+        f"Not sure: {why}. Bring it to where it is, joint by joint.",
+    )
 
 
 def _search_view(content: SessionContent, s: int) -> StationView:

@@ -108,7 +108,7 @@ def _page_beside(path: Path) -> Path:
 
 def session_source(folder: Path, calibration: Path | None = None) -> Source:
     """Session with a calibration, by default the one in its own folder."""
-    session = load_session(folder)
+    session = load_session(folder, fewest=1)
     if not session.stations:
         raise InputError(
             "there are no images to be shown",
@@ -240,7 +240,7 @@ def _session_summary(folder: Path) -> dict[str, object]:
     and whether its calibration lies beside it.
     """
     try:
-        session = load_session(folder)
+        session = load_session(folder, fewest=1)
     except PkmcalError as error:
         return {"mark": Level.WRONG, "text": error.what}
     files = [image.path for station in session.stations for image in station.images]
