@@ -11,6 +11,7 @@ from typing import Any
 
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
+from pkmcal.exporters.from_bodies import bodies_model, is_model
 from pkmcal.firmware.klipper_machines import is_klipper, klipper_model
 from pkmcal.firmware.session import printer_session_texts
 from pkmcal.mechanisms import catalogue
@@ -155,7 +156,8 @@ def new(
         ``klipper``, ``marlin``, ``repetier``, ``reprap`` or ``smoothie``, for a ``printer`` that
         does not show which it is of.
     from_file :
-        Klipper's printer.cfg of a rotary delta or a winch, or a file of a hexapod's joint centres:
+        MJCF, SDF, or URDF with its file of loops; Klipper's printer.cfg of a rotary delta or a
+        winch; or a file of a hexapod's joint centres:
         LinuxCNC's HAL file with pins of genhexkins, or a CSV table with the columns leg, base_x,
         base_y, base_z, platform_x, platform_y, platform_z and their units. Joint centres with
         ``leg``, and where known ``travel`` and ``tube_radius``.
@@ -271,7 +273,13 @@ def _nominal(
 
 
 def _file_model(path: Path, unit: str | None, dimensions: Mapping[str, float]) -> NominalModel:
-    """Nominal model of Klipper's configuration, or of joint centres."""
+    """Nominal model of bodies and joints, of Klipper's configuration, or of joint centres."""
+    if is_model(path):
+        if unit is not None:
+            raise InputError(
+                "a model of bodies is in metres", where="--unit", found=unit, expected="no --unit"
+            )
+        return bodies_model(path, dimensions)
     if not is_klipper(path):
         return centres_model(path, unit, dimensions)
     if unit is not None or dimensions:

@@ -36,7 +36,8 @@ class NominalLeg:
     """Leg of a nominal model, m.
 
     base, rod : their entries in the file. start : A (3,) at home, base frame. platform : B (3,),
-    platform frame. least : shortest length; None for that at home.
+    platform frame. least : shortest length; None for that at home. held : the platform's entry; a
+    ball joint by default. scale : of the reading; 1 if empty.
     """
 
     base: str
@@ -44,6 +45,8 @@ class NominalLeg:
     start: Array
     platform: Array
     least: float | None = None
+    held: str = ""
+    scale: str = ""
 
     __repr__ = short_repr
 
@@ -104,6 +107,7 @@ class NominalModel:
     heading : paragraphs of the file's first comment. numbers : lines of a comment for each number
     that it is made of. home : (3,) position of the platform, m, without rotation. tube_radius : of
     every leg's cylinder, None for legs without. assumed : names of numbers that were not given.
+    home_entry : the file's home; ``home`` to the micrometre by default.
     """
 
     name: str
@@ -114,6 +118,7 @@ class NominalModel:
     home: Array
     tube_radius: float | None = None
     assumed: tuple[str, ...] = ()
+    home_entry: str = ""
 
     __repr__ = short_repr
 
@@ -122,6 +127,7 @@ class NominalModel:
         lines = [line for part in self.heading for line in textwrap.wrap(part, 96)]
         for first, *rest in self.numbers:
             lines += ["", first, *(f"  {line}" for line in rest)]
+        home = self.home_entry or f"{{position: {_numbers(self.home)}}}"
         comment = "\n".join(f"# {line}".rstrip() for line in lines)
         sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
         return (
@@ -130,7 +136,7 @@ class NominalModel:
             " same\n# directions at home; z is up. Replace any centre by a better one.\nlegs:\n"
             + "".join(map(self._leg_text, self.legs))
             + f"\n# The platform frame's origin in the middle of the workspace.\n"
-            f"home: {{position: {_numbers(self.home)}}}\n\n"
+            f"home: {home}\n\n"
             "# Standard deviations of these numbers: how well they were measured, and made.\n"
             f"tolerance: {{center: {millimetres(sigma)}, offset: {millimetres(sigma)}}}\n"
         )
@@ -161,8 +167,9 @@ class NominalModel:
 
     def _leg_text(self, leg: NominalLeg) -> str:
         """Entry of a leg."""
-        platform = f"{{joint: spherical, center: {_numbers(leg.platform)}}}"
+        platform = leg.held or f"{{joint: spherical, center: {_numbers(leg.platform)}}}"
         text = f"  - base: {leg.base}\n    platform: {platform}\n    length: {leg.rod}\n"
+        text += f"    scale: {leg.scale}\n" if leg.scale else ""
         if self.tube_radius is None:
             return text
         length = float(np.linalg.norm(leg.platform + self.home - leg.start))
