@@ -156,11 +156,11 @@ def new(
         ``klipper``, ``marlin``, ``repetier``, ``reprap`` or ``smoothie``, for a ``printer`` that
         does not show which it is of.
     from_file :
-        MJCF, SDF, or URDF with its file of loops; Klipper's printer.cfg of a rotary delta or a
-        winch; or a file of a hexapod's joint centres:
-        LinuxCNC's HAL file with pins of genhexkins, or a CSV table with the columns leg, base_x,
-        base_y, base_z, platform_x, platform_y, platform_z and their units. Joint centres with
-        ``leg``, and where known ``travel`` and ``tube_radius``.
+        MJCF, SDF, or URDF with its file of loops, all with ``tube_radius`` where known; Klipper's
+        printer.cfg of a rotary delta or a winch; or a file of a hexapod's joint centres: LinuxCNC's
+        HAL file with pins of genhexkins, or a CSV table with the columns leg, base_x, base_y,
+        base_z, platform_x, platform_y, platform_z and their units. Joint centres with ``leg``, and
+        where known ``travel`` and ``tube_radius``.
     unit :
         ``mm`` or ``inch``, of the lengths in a HAL file.
     base_radius, platform_radius :

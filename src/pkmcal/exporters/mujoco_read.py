@@ -15,6 +15,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.exporters.read_model import (
+    JOINT_BODY,
     NO_LIMITS,
     ReadBody,
     ReadCoupling,
@@ -23,7 +24,7 @@ from pkmcal.exporters.read_model import (
     ReadModel,
     body_poses,
 )
-from pkmcal.exporters.xml_read import attribute, refused, unit_axis, vector, xml_root
+from pkmcal.exporters.xml_read import TUBE_MARK, attribute, refused, unit_axis, vector, xml_root
 from pkmcal.geometry.rigid import from_quaternion, inverse, pose, pose_difference, rotation
 
 UNREAD_ELEMENTS = ("include", "replicate", "composite", "flexcomp", "frame", "attach")
@@ -79,37 +80,41 @@ def read_mujoco(text: str) -> ReadModel:
     )  # fmt: skip
 
 
+Classes = dict[str, dict[str, dict[str, str]]]
+"""Attributes by class and tag."""
+
+
 def _fill_defaults(root: Element) -> None:
     """Write the attributes of default classes into the joints, sites and constraints."""
-    classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
-
-    def collect(node: Element, above: dict[str, dict[str, str]]) -> None:
-        """Attributes by tag of a class and of the classes inside it."""
-        own = {tag: dict(values) for tag, values in above.items()}
-        for child in node:
-            if child.tag != "default":
-                own[child.tag] = own.get(child.tag, {}) | child.attrib
-        classes[node.get("class", "main")] = own
-        for child in node.findall("default"):
-            collect(child, own)
-
-    def fill(node: Element, name: str) -> None:
-        """Attributes of an element and of those inside it; name : class that applies."""
-        own = node.get("class", name)
-        if own not in classes:
-            raise refused(node, "there is no such default class", own, ", ".join(classes))
-        for key, value in classes[own].get(node.tag, {}).items():
-            if key != "class":
-                node.attrib.setdefault(key, value)
-        inside = node.get("childclass", name)
-        for child in node:
-            fill(child, inside)
-
+    classes: Classes = {"main": {}}
     for node in root.findall("default"):
-        collect(node, classes["main"])
+        _collect_class(node, classes["main"], classes)
     for tag in ("worldbody", "equality", "actuator"):
         for node in root.findall(tag):
-            fill(node, "main")
+            _fill(node, "main", classes)
+
+
+def _collect_class(node: Element, above: dict[str, dict[str, str]], classes: Classes) -> None:
+    """Add the attributes of a class, with those of the class around it, and the classes inside."""
+    own = {tag: dict(values) for tag, values in above.items()}
+    for child in node:
+        if child.tag != "default":
+            own[child.tag] = own.get(child.tag, {}) | child.attrib
+    classes[node.get("class", "main")] = own
+    for child in node.findall("default"):
+        _collect_class(child, own, classes)
+
+
+def _fill(node: Element, name: str, classes: Classes) -> None:
+    """Fill the attributes of an element and of those inside it; name : class that applies."""
+    own = node.get("class", name)
+    if own not in classes:
+        raise refused(node, "there is no such default class", own, ", ".join(classes))
+    for key, value in classes[own].get(node.tag, {}).items():
+        node.attrib.setdefault(key, value)
+    inside = node.get("childclass", name)
+    for child in node:
+        _fill(child, inside, classes)
 
 
 def _units(root: Element) -> tuple[float, str]:
@@ -150,7 +155,7 @@ class _Bodies:
             if "name" in site.attrib:
                 self.sites[site.attrib["name"]] = (number, vector(site, "pos", "0 0 0"))
         for geom in node.findall("geom"):
-            if "name" in geom.attrib and "size" in geom.attrib:
+            if TUBE_MARK in geom.get("name", ""):
                 self.radii[geom.attrib["name"]] = float(vector(geom, "size", "", 1, 2, 3)[0])
         for child in node.findall("body"):
             name = child.get("name", f"body {len(self.bodies)}")
@@ -173,7 +178,7 @@ class _Bodies:
         last = np.zeros(3)
         groups = groups[1:] if len(groups) > 1 and not groups[0][1] else groups
         for k, (point, joints) in enumerate(groups):
-            own = name if k == len(groups) - 1 else f"{name} joint {k + 1}"
+            own = name if k == len(groups) - 1 else f"{name} {k + 1}{JOINT_BODY}"
             offset = pose(np.eye(3), point - last)
             T = place @ offset if k == 0 else offset
             self.bodies.append(ReadBody(own, parent, T, tuple(joints)))
@@ -225,19 +230,16 @@ class _Bodies:
 def _drives(root: Element, joints: dict[str, ReadJoint]) -> list[Element]:
     """Actuators, one for each joint that they move."""
     out: dict[str, Element] = {}
-    for part in root.findall("actuator"):
-        for node in part:
-            if node.get("joint") not in joints:
-                found = next(
-                    (k for k in ("tendon", "site", "body", "joint") if k in node.attrib), None
-                )
-                raise refused(
-                    node,
-                    "an actuator that moves no single joint is not read",
-                    found and f'{found}="{node.attrib[found]}"',
-                    "the joint, a hinge or a slide, that it moves",
-                )
-            out.setdefault(node.attrib["joint"], node)
+    for node in root.iterfind("actuator/*"):
+        if node.get("joint") not in joints:
+            keys = [key for key in ("tendon", "site", "body", "joint") if key in node.attrib]
+            raise refused(
+                node,
+                "an actuator that moves no single joint is not read",
+                f'{keys[0]}="{node.attrib[keys[0]]}"' if keys else None,
+                "the joint, a hinge or a slide, that it moves",
+            )
+        out.setdefault(node.attrib["joint"], node)
     return list(out.values())
 
 

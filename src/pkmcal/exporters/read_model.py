@@ -23,6 +23,8 @@ from pkmcal.geometry.rigid import (
 )
 
 NO_TRANSLATION = np.zeros(3)
+JOINT_BODY = " joint"
+"""End of the names of bodies that readers add where a joint is beside its body's origin."""
 NO_LIMITS = np.full(2, np.nan)
 MOST_CLOSING_STEPS = 30
 LOOPS_CLOSED_STEP = 1e-13

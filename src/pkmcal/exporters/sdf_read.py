@@ -8,8 +8,16 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.exporters.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
+from pkmcal.exporters.read_model import (
+    JOINT_BODY,
+    ReadBody,
+    ReadCoupling,
+    ReadJoint,
+    ReadLoop,
+    ReadModel,
+)
 from pkmcal.exporters.xml_read import (
+    TUBE_MARK,
     attribute,
     label_of,
     limits_of,
@@ -27,6 +35,7 @@ SDF_JOINT_AXES = {
     "continuous": ("axis",),
     "prismatic": ("axis",),
     "universal": ("axis", "axis2"),
+    "revolute2": ("axis", "axis2"),
     "ball": (),
     "fixed": (),
 }
@@ -82,9 +91,10 @@ def read_sdf(text: str) -> ReadModel:
         ),
         sites=sites,
         radii={
-            node.attrib["name"]: float(node.findtext("geometry/cylinder/radius", "nan"))
+            name: float(numbers(node, radius.text or "", (1,), "radius")[0])
             for node in model.iter("visual")
-            if "name" in node.attrib
+            if TUBE_MARK in (name := node.get("name", ""))
+            and (radius := node.find("geometry/cylinder/radius")) is not None
         },
         actuated=np.array([tree.joint(n, model).dof for n in tree.readings], dtype=int),
         gear=np.array([1 / float(values["scale"]) for values in tree.readings.values()]),
@@ -198,7 +208,7 @@ class _Links:
             T_joint_link = inverse(at) @ place
             body = ReadBody(link, number, inverse(self.drawn(parent)) @ at, self._axes(name, at))
             if np.abs(T_joint_link - np.eye(4)).max() > SAME_FRAME:  # a joint beside the origin
-                self.bodies.append(body._replace(name=f"{link} joint"))
+                self.bodies.append(body._replace(name=f"{link}{JOINT_BODY}"))
                 body = ReadBody(link, len(self.bodies) - 1, T_joint_link, ())
         else:  # held by loops only
             joint = ReadJoint(link, "free", np.zeros(3), len(self.key), 0.0)
@@ -238,9 +248,8 @@ class _Links:
             xyz, part = node.find(f"{tag}/xyz"), node.find(tag)
             axis = numbers(node, "0 0 1" if xyz is None else xyz.text or "", (3,), f"{tag}/xyz")
             frame = "" if xyz is None else xyz.get("expressed_in", "")
-            if self.version < MODEL_AXES_BEFORE or node.findtext(
-                f"{tag}/use_parent_model_frame", "0"
-            ) in ("1", "true"):
+            of_model = node.findtext(f"{tag}/use_parent_model_frame", "0").strip()
+            if self.version < MODEL_AXES_BEFORE or of_model in ("1", "true"):
                 frame = SDF_MODEL_FRAME
             if frame:
                 axis = at[:3, :3].T @ self.drawn(frame)[:3, :3] @ axis

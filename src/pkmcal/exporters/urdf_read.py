@@ -23,6 +23,7 @@ from pkmcal.exporters.read_model import (
     ReadModel,
 )
 from pkmcal.exporters.xml_read import (
+    TUBE_MARK,
     attribute,
     limits_of,
     numbers,
@@ -72,68 +73,20 @@ def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadMode
         raise InputError(
             "a xacro file is not read", found=foreign[0].tag, expected="the URDF that it expands to"
         )
-    links = {attribute(node, "name"): node for node in root.findall("link")}
-    joint_above = {_link(node, "child", links): node for node in root.findall("joint")}
-    bodies: list[ReadBody] = []
-    numbered: dict[str, int] = {}
-    joints: dict[str, ReadJoint] = {}
-
-    def put(link: str, depth: int = 0) -> int:
-        """Index of a link's body, added after its parent's if necessary."""
-        if link in numbered:
-            return numbered[link]
-        node = joint_above.get(link)
-        if depth > len(links):
-            raise refused(links[link], "a link is above itself, and a URDF is a tree")
-        if node is None:  # the root
-            if bodies:
-                raise refused(links[link], "a URDF has one root", f"{bodies[0].name} besides")
-            bodies.append(ReadBody(link, 0, np.eye(4), ()))
-        else:
-            parent, own = put(_link(node, "parent", links), depth + 1), tuple[ReadJoint, ...]()
-            if node.get("type") != "fixed":
-                own = (_joint(node, len(joints)),)
-                joints[own[0].name] = own[0]
-            bodies.append(ReadBody(link, parent, _origin_pose(node), own))
-        numbered[link] = len(bodies) - 1
-        return numbered[link]
-
-    def named(name: str) -> ReadJoint:
-        """Joint by name."""
-        if name not in joints:
-            raise InputError("there is no such joint in the URDF", where=loops_name, found=name)
-        return joints[name]
-
-    for link in links:
-        put(link)
-    # joints that follow others, and the state at home
-    couplings: list[ReadCoupling] = []
-    for node in root.findall("joint"):
-        if (mimic := node.find("mimic")) is not None:
-            ratio = float(vector(mimic, "multiplier", "1", 1)[0])
-            offset = float(vector(mimic, "offset", "0", 1)[0])
-            own, leader = named(attribute(node, "name")), named(attribute(mimic, "joint"))
-            couplings.append(ReadCoupling(own.dof, leader.dof, ratio, offset))
-    key = np.zeros(len(joints))
+    tree = _Tree(root, loops_name)
+    couplings = _couplings(root, tree)
+    # the state at home
+    key = np.zeros(len(tree.joints))
     for name, value in beside.home.items():
-        key[named(name).dof] = value
+        key[tree.joint(name).dof] = value
     for c in couplings:
         key[c.follower] = c.ratio * key[c.leader] + c.offset
-    # named links: each leg's base, and the two ends of each loop
-    ends = {f"{leg.name}_base": numbered[rod] for leg in beside.loops
-            if (rod := f"{leg.name}_rod") in numbered}  # fmt: skip
-    for loop in beside.loops:
-        for name in loop.frames:
-            if name not in numbered:
-                raise InputError("there is no such link in the URDF", where=loops_name, found=name)
-            ends[name] = numbered[name]
-    radii = {
-        node.attrib["name"]: float(vector(cylinder, "radius", "", 1)[0])
-        for node in root.iter("visual")
-        if "name" in node.attrib and (cylinder := node.find("geometry/cylinder")) is not None
-    }
+    # named links: the two ends of each loop, and each leg's base
+    ends = {name: tree.link(name) for loop in beside.loops for name in loop.frames}
+    rods = ((f"{loop.name}_base", f"{loop.name}_rod") for loop in beside.loops)
+    sites = ends | {name: tree.numbers[rod] for name, rod in rods if rod in tree.numbers}
     return ReadModel(
-        bodies=tuple(bodies),
+        bodies=tuple(tree.bodies),
         loops=tuple(
             ReadLoop(
                 loop.coincide == "pose",
@@ -142,14 +95,94 @@ def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadMode
             )
             for loop in beside.loops
         ),
-        couplings=tuple(couplings),
-        sites={name: (body, np.zeros(3)) for name, body in ends.items()},
-        radii=radii,
-        actuated=np.array([named(r.joint).dof for r in beside.readings], dtype=int),
+        couplings=couplings,
+        sites={name: (body, np.zeros(3)) for name, body in sites.items()},
+        radii={
+            name: float(vector(cylinder, "radius", "", 1)[0])
+            for node in root.iter("visual")
+            if TUBE_MARK in (name := node.get("name", ""))
+            and (cylinder := node.find("geometry/cylinder")) is not None
+        },
+        actuated=np.array([tree.joint(r.joint).dof for r in beside.readings], dtype=int),
         gear=np.array([1 / r.scale for r in beside.readings]),
         ctrl=np.array([r.home for r in beside.readings]),
         key=key,
     )
+
+
+class _Tree:
+    """Links as bodies, each added after its parent.
+
+    numbers : index of each link's body. joints : by name.
+    """
+
+    def __init__(self, root: Element, loops_name: str) -> None:
+        self.loops_name = loops_name
+        self.links = {attribute(node, "name"): node for node in root.findall("link")}
+        self.above = {self._end(node, "child"): node for node in root.findall("joint")}
+        self.bodies: list[ReadBody] = []
+        self.numbers: dict[str, int] = {}
+        self.joints: dict[str, ReadJoint] = {}
+        for link in self.links:
+            self._put(link)
+
+    def link(self, name: str) -> int:
+        """Index of the body of a link that the file of loops names."""
+        if name not in self.numbers:
+            raise InputError("there is no such link in the URDF", where=self.loops_name, found=name)
+        return self.numbers[name]
+
+    def joint(self, name: str) -> ReadJoint:
+        """Joint that a mimic or the file of loops names."""
+        if name not in self.joints:
+            raise InputError(
+                "there is no such joint in the URDF", where=self.loops_name, found=name
+            )
+        return self.joints[name]
+
+    def _end(self, joint: Element, which: str) -> str:
+        """Name of a joint's parent or child link."""
+        node = joint.find(which)
+        name = "" if node is None else node.get("link", "")
+        if name not in self.links:
+            raise refused(joint, f"there is no link that is its {which}", name)
+        return name
+
+    def _put(self, link: str, depth: int = 0) -> int:
+        """Index of a link's body, added after its parent's if necessary."""
+        if link in self.numbers:
+            return self.numbers[link]
+        node = self.above.get(link)
+        if depth > len(self.links):
+            raise refused(self.links[link], "a link is above itself, and a URDF is a tree")
+        if node is None:  # the root
+            if self.bodies:
+                raise refused(
+                    self.links[link], "a URDF has one root", f"{self.bodies[0].name} besides"
+                )
+            self.bodies.append(ReadBody(link, 0, np.eye(4), ()))
+        else:
+            parent, own = self._put(self._end(node, "parent"), depth + 1), tuple[ReadJoint, ...]()
+            if node.get("type") != "fixed":
+                own = (_joint(node, len(self.joints)),)
+                self.joints[own[0].name] = own[0]
+            self.bodies.append(ReadBody(link, parent, _origin_pose(node), own))
+        self.numbers[link] = len(self.bodies) - 1
+        return self.numbers[link]
+
+
+def _couplings(root: Element, tree: _Tree) -> tuple[ReadCoupling, ...]:
+    """Joints that follow others."""
+    out: list[ReadCoupling] = []
+    for node in root.findall("joint"):
+        if (mimic := node.find("mimic")) is not None:
+            ratio = float(vector(mimic, "multiplier", "1", 1)[0])
+            offset = float(vector(mimic, "offset", "0", 1)[0])
+            follower, leader = attribute(node, "name"), attribute(mimic, "joint")
+            out.append(
+                ReadCoupling(tree.joint(follower).dof, tree.joint(leader).dof, ratio, offset)
+            )
+    return tuple(out)
 
 
 def _joint(node: Element, dof: int) -> ReadJoint:
@@ -164,15 +197,6 @@ def _joint(node: Element, dof: int) -> ReadJoint:
     if limit is not None:
         limits = limits_of(limit, limit.get("lower"), limit.get("upper"))
     return ReadJoint(attribute(node, "name"), kind, unit_axis(node, axis), dof, 0.0, limits)
-
-
-def _link(joint: Element, which: str, links: dict[str, Element]) -> str:
-    """Name of a joint's parent or child link."""
-    node = joint.find(which)
-    name = "" if node is None else node.get("link", "")
-    if name not in links:
-        raise refused(joint, f"there is no link that is its {which}", name)
-    return name
 
 
 def _origin_pose(node: Element) -> Array:

@@ -15,6 +15,8 @@ MOST_ELEMENTS, MOST_LEVELS = 20_000, 100
 twenty."""
 LARGEST_MODEL_FILE = 2**22
 """Largest file of a model, bytes."""
+TUBE_MARK = "_tube"
+"""Part of the names of the cylinders that are a leg's; other shapes are not read."""
 LARGEST_LIMIT = 1e3
 """Joint limit, m or rad, above which it stands for none."""
 

@@ -128,12 +128,17 @@ class NominalModel:
         for first, *rest in self.numbers:
             lines += ["", first, *(f"  {line}" for line in rest)]
         home = self.home_entry or f"{{position: {_numbers(self.home)}}}"
+        frames = "# Base joints in the base frame, platform joints in the platform frame"
+        frames += (
+            ".\n# "
+            if self.home_entry
+            else (", which has the same\n# directions at home; z is up. ")
+        )
         comment = "\n".join(f"# {line}".rstrip() for line in lines)
         sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
         return (
             f"{comment}\nname: {self.name}\nmotion: {self.motion}\n\n"
-            "# Base joints in the base frame, platform joints in the platform frame, which has the"
-            " same\n# directions at home; z is up. Replace any centre by a better one.\nlegs:\n"
+            f"{frames}Replace any centre by a better one.\nlegs:\n"
             + "".join(map(self._leg_text, self.legs))
             + f"\n# The platform frame's origin in the middle of the workspace.\n"
             f"home: {home}\n\n"
