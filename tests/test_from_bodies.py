@@ -9,10 +9,11 @@ import pytest
 
 import pkmcal
 from conftest import run
-from mujoco_machines import ALL, machine_of
+from mujoco_machines import ALL, LOUD, machine_of
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import exporters
+from pkmcal.exporters.mujoco_read import read_mujoco
 from pkmcal.exporters.samples import samples
 from pkmcal.exporters.xml_read import LARGEST_MODEL_FILE
 from pkmcal.geometry.rigid import (
@@ -109,7 +110,7 @@ def mjcf():
         at = a - upright(u) @ down
         rod = SubElement(base, "body", pos=words(at), euler=words(turn), childclass="leg")
         if k == 5:
-            SubElement(rod, "joint", type="ball", pos=words(down))
+            SubElement(rod, "joint", type="ball", pos=words(down), range="0 0", limited="false")
         else:
             SubElement(rod, "joint", pos=words(down))
             SubElement(rod, "joint", pos=words(down), axis="0 1 0")
@@ -182,6 +183,32 @@ def test_an_mjcf_of_another_origin(tmp_path):
     assert all(leg.tubes[0].radius == 0.01 for leg in machine.document.legs)
     joints = [leg.base.joint for leg in machine.document.legs]
     assert joints == ["spherical"] + ["universal"] * 5
+
+
+def test_mujoco_has_the_bodies_where_they_are_read():
+    """At values of all hinges and slides; MuJoCo's order is that of the state."""
+    mujoco = pytest.importorskip("mujoco", reason=LOUD)
+    root = mjcf()
+    for node in root.iter("body"):  # MuJoCo needs masses
+        SubElement(node, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
+    theirs = mujoco.MjModel.from_xml_string(tostring(root, encoding="unicode"))
+    data, model = mujoco.MjData(theirs), read_mujoco(tostring(mjcf(), encoding="unicode"))
+    assert theirs.nv == model.key.size
+    x, rng = model.key.copy(), np.random.default_rng(1)
+    kinds = {int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)}
+    for k in range(theirs.njnt):
+        if int(theirs.jnt_type[k]) in kinds:
+            value = data.qpos[theirs.jnt_qposadr[k]] + 0.2 * rng.normal()
+            data.qpos[theirs.jnt_qposadr[k]] = x[theirs.jnt_dofadr[k]] = value
+    assert np.count_nonzero(x != model.key) == 17  # ten hinges, six slides, the gripper
+    mujoco.mj_kinematics(theirs, data)
+    places = model.places(x)
+    names = [theirs.body(k).name for k in range(theirs.nbody)]
+    compared = [(k, name) for k, name in enumerate(names) if name]
+    assert len(compared) == 10
+    for k, name in compared:
+        place = pose(data.xmat[k].reshape(3, 3), data.xpos[k])
+        np.testing.assert_allclose(places[name], place, atol=1e-12)
 
 
 def test_an_sdf_of_another_origin(tmp_path):
