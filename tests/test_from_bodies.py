@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from xml.etree.ElementTree import Element, SubElement, tostring
+from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
 
 import numpy as np
 import pytest
@@ -301,7 +301,13 @@ ENTITIES = (
     + "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 9)).replace("a0", "a")
     + "]><mujoco>&a8;</mujoco>"
 )
+LONG = "".join(
+    f'<link name="{k}"/><joint name="j{k}" type="ball"><parent>{k + 1}</parent><child>{k}</child>'
+    "</joint>"
+    for k in range(3000)
+)
 HOSTILE = {
+    "a long chain": f'<sdf version="1.7"><model name="m"><link name="3000"/>{LONG}</model></sdf>',
     "entities": ENTITIES,
     "a file from outside": '<!DOCTYPE m [<!ENTITY f SYSTEM "file:///etc/passwd">]><mujoco>&f;</mujoco>',
     "too deep": "<mujoco><worldbody>"
@@ -330,3 +336,21 @@ def test_hostile_xml_is_refused(what, tmp_path):
     result = run("new", tmp_path / "mine", "--from", path)
     assert result.code == 2
     assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "element", "attribute", "value"),
+    [
+        # a universal joint whose second axis is not square to the leg restricts its twist otherwise
+        ("3-upu", ".//joint[@name='leg1_base_second']", "axis", "0.1 0.7 0.7"),
+        # bars that turn back by less than the platform turns
+        ("h4", "equality/joint", "polycoef", "0 -0.9 0 0 0"),
+    ],
+)
+def test_a_model_that_moves_otherwise_is_refused(name, element, attribute, value, tmp_path):
+    (text,) = exporters()["mujoco"].files(MachineSource(machine_of(name))).values()
+    root = fromstring(text)
+    root.find(element).set(attribute, value)
+    with pytest.raises(InputError) as error:
+        read(written(root, tmp_path), tmp_path)
+    assert "size" in error.value.found

@@ -13,6 +13,8 @@ from pkmcal.files import quoted
 MOST_ELEMENTS, MOST_LEVELS = 20_000, 100
 """Most elements of a file, and most elements inside each other: a robot has a few hundred, and some
 twenty."""
+MOST_PARTS, PART_TAGS = 600, frozenset({"body", "link", "joint", "connect", "weld"})
+"""Most bodies and joints of a machine, and the elements that are one."""
 LARGEST_MODEL_FILE = 2**22
 """Largest file of a model, bytes."""
 TUBE_MARK = "_tube"
@@ -44,6 +46,13 @@ def xml_root(text: str) -> Element:
                 expected=f"at most {MOST_ELEMENTS} elements and {MOST_LEVELS} levels",
             )
         layer = [child for node in layer for child in node]
+    parts = sum(node.tag in PART_TAGS for node in root.iter())
+    if parts > MOST_PARTS:
+        raise InputError(
+            "the file has too many bodies and joints for a machine",
+            found=parts,
+            expected=f"at most {MOST_PARTS}",
+        )
     return root
 
 
