@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from pkmcal.boards.board import chessboard, load_board
+from pkmcal.boards.circles import circle_centres, find_circles
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.find import Markers, detect_board, detect_markers, dictionary
 from pkmcal.boards.layout import another_grid, marker_layout
+from pkmcal.boards.prints import Print
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
+from pkmcal.files import yaml_text
 from pkmcal.geometry.rigid import apply, inverse, pose, rotation
 
 SIZE = (480, 360)
@@ -22,6 +25,13 @@ FILES = {
     "chessboard": "type: chessboard\ncorners: [8, 5]\nsquare: 0.03\n",
     "aruco_grid": "type: aruco_grid\nmarkers: [5, 4]\nmarker: 0.04\ngap: 0.012\n"
     "dictionary: DICT_APRILTAG_36h11\n",
+    "circle_grid": "type: circle_grid\ncircles: [8, 6]\nspacing: 0.03\n",
+    "circle_grid_asymmetric": (
+        "type: circle_grid\ncircles: [4, 11]\nspacing: 0.02\nasymmetric: true\n"
+    ),
+    "kalibr_aprilgrid": (
+        "target_type: 'aprilgrid'\ntagCols: 5\ntagRows: 4\ntagSize: 0.036\ntagSpacing: 0.3\n"
+    ),
 }
 
 
@@ -53,6 +63,8 @@ def texture(board, per_square=60):
         y, x = np.mgrid[: rows * per_square, : columns * per_square] // per_square
         image = np.where((x + y) % 2 == 0, 20, 230).astype(np.uint8)
         return image, per_square, per_square / data["square"]
+    if board.type == "circle_grid":
+        return circles(board)
     words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, data["dictionary"]))
     if board.type == "charuco":
         printed = cv2.aruco.CharucoBoard(
@@ -61,7 +73,7 @@ def texture(board, per_square=60):
         size = [n * per_square for n in data["squares"]]
         scale = per_square / data["square"]
     else:
-        return marker_grid(data, words)
+        return aprilgrid(data) if data["leftward"] else marker_grid(data, words)
     image = printed.generateImage(tuple(size), marginSize=0, borderBits=1)
     return (20 + image * (210 / 255)).astype(np.uint8), 0, scale
 
@@ -76,6 +88,38 @@ def marker_grid(data, words, side=80):
         marker = cv2.aruco.generateImageMarker(words, k, side)
         image[y : y + side, x : x + side] = 20 + marker * (210 / 255)
     return image, 0, side / data["marker"]
+
+
+def circles(board, per_spacing=80):
+    """As :func:`texture`; circles with a radius of a third of the spacing."""
+    scale, middles = per_spacing / board.document["spacing"], board.points[:, :2]
+    size = np.rint((middles.max(axis=0)[::-1]) * scale).astype(int) + 2 * per_spacing
+    image = np.full(size, 230, dtype=np.uint8)
+    for at in middles * scale + per_spacing - 0.5:
+        centre = tuple(np.rint(at * 256).astype(int).tolist())
+        cv2.circle(image, centre, round(per_spacing / 3 * 256), 20, -1, cv2.LINE_AA, 8)
+    return image, per_spacing, scale
+
+
+def aprilgrid(data, side=80):
+    """As :func:`texture`, from Kalibr's rules: tags with a border of two modules and black squares
+    at their corners, the first at the lower left with its code rotated by 180 degrees, ids to the
+    right and upward; then turned by 180 degrees, so that the tags are upright.
+    """
+    columns, rows = data["markers"]
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    gap = round(side * data["gap"] / data["marker"])
+    step = side + gap
+    image = np.full((rows * step + gap, columns * step + gap), 230, dtype=np.uint8)
+    for k in range(rows * columns):
+        y, x = (rows - 1 - k // columns) * step + gap, k % columns * step + gap
+        bits = cv2.aruco.generateImageMarker(words, k, 8)[1:-1, 1:-1]
+        tag = np.pad(bits, 2)[::-1, ::-1].repeat(side // 10, axis=0).repeat(side // 10, axis=1)
+        for dy, dx in np.ndindex(2, 2):
+            corner = y - gap + dy * step, x - gap + dx * step
+            image[corner[0] : corner[0] + gap, corner[1] : corner[1] + gap] = 20
+        image[y : y + side, x : x + side] = 20 + tag * (210 / 255)
+    return np.ascontiguousarray(image[::-1, ::-1]), gap, side / data["marker"]
 
 
 def render(camera, T_camera_board, board, seed=0, noise=2.0, fine=4, hide=None):
@@ -125,6 +169,9 @@ VIEWS = {
     ("chessboard", "pinhole"): ((0.4, 0.2, -0.3), (0.0, 0.05), 0.4),
     ("chessboard", "fisheye"): ((0.2, 0.5, 0.1), (-0.5, 0.1), 0.14),
     ("aruco_grid", "pinhole"): ((0.3, 0.3, 0.05), (0.0, 0.0), 0.45),
+    ("circle_grid", "pinhole"): ((0.5, 0.4, 0.05), (0.0, 0.0), 0.42),
+    ("circle_grid_asymmetric", "pinhole"): ((-0.4, 0.5, 0.2), (0.0, 0.0), 0.42),
+    ("kalibr_aprilgrid", "pinhole"): ((0.3, -0.3, 0.1), (0.0, 0.0), 0.38),
 }
 
 
@@ -307,11 +354,114 @@ def test_a_layout_is_that_of_the_markers_whatever_the_lens(tmp_path):
     assert marker_layout([Markers(ids[:2], corners[:2]) for ids, corners in results]) is None
 
 
+def test_a_circles_centre_is_not_its_images_centroid(tmp_path):
+    """At a large tilt the detector finds centroids, which perspective displaces."""
+    board = board_of(tmp_path, FILES["circle_grid"])
+    T_camera_board = view(board, (0.0, 0.9, 0.0), (0.0, 0.0), 0.42)
+    image = render(CAMERAS["pinhole"], T_camera_board, board)
+    truth = CAMERAS["pinhole"].project(apply(T_camera_board, board.points))
+    rough = find_circles(image, board)
+    centres, good, _ = circle_centres(image, board, rough)
+    assert good.all()
+    assert np.sqrt(np.mean((rough - truth) ** 2)) > 0.1
+    assert np.sqrt(np.mean((centres - truth) ** 2)) < 0.02
+
+
+@pytest.mark.parametrize("kind", ["circle_grid", "kalibr_aprilgrid"])
+def test_boards_of_other_programs_are_not_printed(tmp_path, kind):
+    with pytest.raises(InputError) as caught:
+        Print.of(board_of(tmp_path, FILES[kind]))
+    assert caught.value.what == "boards of this kind are not printed"
+
+
+def test_grids_that_look_the_same_turned_by_half(tmp_path):
+    texts = {
+        "type: circle_grid\ncircles: [5, 4]\nspacing: 0.03\n": True,
+        "type: circle_grid\ncircles: [4, 11]\nspacing: 0.03\nasymmetric: true\n": False,
+        "type: circle_grid\ncircles: [4, 10]\nspacing: 0.03\nasymmetric: true\n": True,
+    }
+    for text, turnable in texts.items():
+        board = board_of(tmp_path, text)
+        turned = board.points.max(axis=0) - board.points
+        places = {tuple(at) for at in np.rint(board.points * 1e4).astype(int).tolist()}
+        same = {tuple(at) for at in np.rint(turned * 1e4).astype(int).tolist()} == places
+        assert board.turnable == turnable == same
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "counts"),
+    [
+        (
+            "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\n"
+            "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n",
+            "chessboard",
+            (6, 7),
+        ),
+        (FILES["kalibr_aprilgrid"], "aruco_grid", (5, 4)),
+        (
+            "target_type: 'circlegrid'\ntargetCols: 6\ntargetRows: 7\nspacingMeters: 0.02\n"
+            "asymmetricGrid: False\n",
+            "circle_grid",
+            (6, 7),
+        ),
+    ],
+)
+def test_targets_of_kalibr(tmp_path, text, kind, counts):
+    board = board_of(tmp_path, text)
+    assert (board.type, board.counts) == (kind, counts)
+    for line in text.splitlines()[1:]:
+        with pytest.raises(InputError) as caught:
+            board_of(tmp_path, text.replace(line + "\n", ""))
+        assert caught.value.where.endswith(line.partition(":")[0])
+    with pytest.raises(InputError) as caught:
+        board_of(tmp_path, text.replace("target_type: '", "target_type: 'x"))
+    assert caught.value.what == "no such type of target"
+
+
+def test_a_grid_of_kalibr_described_as_one_that_runs_to_the_right(tmp_path):
+    """Ids that go on to the left are named, in place of a lens that fits them."""
+    board = board_of(tmp_path, FILES["kalibr_aprilgrid"])
+    image = render(CAMERAS["pinhole"], view(board, *VIEWS["kalibr_aprilgrid", "pinhole"]), board)
+    path = tmp_path / "tags.png"
+    cv2.imwrite(str(path), image)
+    (detection,) = detect_boards([path], board)
+    assert detection.success
+    text = yaml_text({**board.document, "leftward": False})
+    with pytest.raises(InputError, match="another board") as caught:
+        detect_boards([path], board_of(tmp_path, text))
+    assert "ids go on by -1 to the right and by +5 downward" in caught.value.found
+
+
 def test_two_boards_mixed(pictures):
+    """A minority of images with another board is not used, with the reason; a majority refused."""
     board, paths = pictures["charuco"]
+    other = pictures["chessboard"][1]
+    *right, odd = detect_boards([*paths, other[0]], board)
+    assert all(detection.success for detection in right)
+    assert not odd.success
+    assert "a chessboard of 8x5 inner corners" in odd.reason
     with pytest.raises(InputError, match="two boards are mixed") as caught:
-        detect_boards([*paths, pictures["chessboard"][1][0]], board)
+        detect_boards([paths[0], *other[:2]], board)
     assert caught.value.found == "a chessboard of 8x5 inner corners"
+
+
+def test_a_board_without_readable_markers_is_no_other_board(tmp_path, pictures):
+    """White paper over the markers of one image, of which the squares are a chessboard then."""
+    board, paths = pictures["charuco"]
+    detection = detect_boards(paths, board)[0]
+    image = cv2.imread(str(paths[0]), cv2.IMREAD_GRAYSCALE)
+    homography, _ = cv2.findHomography(board.points[detection.ids, :2], detection.pixels)
+    square, half = board.document["square"], board.document["marker"] * 0.55
+    for row, column in np.ndindex(*board.document["squares"][::-1]):
+        if (row + column) % 2:
+            middle = (np.array([column, row]) + 0.5) * square
+            sides = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+            quad = cv2.perspectiveTransform(sides[None], homography)
+            cv2.fillPoly(image, [np.rint(quad[0]).astype(np.int32)], int(image.max()))
+    cv2.imwrite(str(tmp_path / "unread.png"), image)
+    *right, odd = detect_boards([*paths, tmp_path / "unread.png"], board)
+    assert all(one.success for one in right)
+    assert not odd.success
 
 
 def test_no_board_anywhere(tmp_path, pictures):
@@ -342,7 +492,7 @@ def test_images_of_two_sizes(tmp_path, pictures):
         ("type: charucco\n", "board.yaml, line 1, type: no such type of board; found charucco, "
          "expected charuco."),
         ("square: 0.03\n", "board.yaml, type: the board's type is missing; expected charuco or "
-         "chessboard or aruco_grid."),
+         "chessboard or aruco_grid or circle_grid."),
         (FILES["charuco"].replace("0.022", "0.04"), "board.yaml, line 4, marker: a marker of 0.04 "
          "m does not fit into a square of 0.03 m."),
         (FILES["charuco"].replace("5X5_100", "5X5_10"), "board.yaml, line 5, dictionary: OpenCV "

@@ -28,7 +28,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import explain
 from pkmcal.judge.causes import single_causes
 from pkmcal.mechanisms import load_mechanism, mechanism_text
-from pkmcal.mechanisms.carriers.contract import base_carriers
+from pkmcal.mechanisms.carriers.contract import Winding, base_carriers
 from pkmcal.mechanisms.carriers.crank import Crank
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
 from pkmcal.mechanisms.drives import BENT_GUIDE_PIECES, drives_of
@@ -237,7 +237,8 @@ def test_defaults_are_what_the_package_s_carriers_give_themselves():
         parameters, q = rng.normal(size=(4, len(carrier.parameters))), rng.normal(size=4)
         default = super(carrier, carrier).by_parameters(parameters, q)
         np.testing.assert_allclose(default, carrier.by_parameters(parameters, q), atol=1e-13)
-        if carrier.driven:
+        # the length of a cable contains what lies on its pulley
+        if carrier.driven and not issubclass(carrier, Winding):
             b, near = rng.normal(size=(4, 3)), q + 0.01
             length = np.linalg.norm(b - carrier.place(parameters, q)[0], axis=1)
             values = super(carrier, carrier).reading(parameters, b, length, near)

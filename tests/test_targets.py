@@ -15,8 +15,6 @@ from pkmcal.boards.poses import (
     one_a_configuration,
     standing_board,
 )
-from pkmcal.camera_calibration.model_selection import DISTORTION_CANDIDATES
-from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose, pose_difference, rotation
 from test_boards import CAMERAS, FILES, board_of, render
@@ -320,8 +318,3 @@ def test_all_camera_models_see_a_still_board(board):
         assert stood.agreed.all()
         error = pose_difference(stood.T_camera_board, place)
         assert error @ np.linalg.solve(stood.covariance, error) < 24
-
-
-def test_the_cameras_of_the_tests_are_of_every_model_that_is_fitted():
-    assert CAMERAS.keys() == DISTORTION_CANDIDATES.keys()
-    assert all(type(camera) is camera_models()[model] for model, camera in CAMERAS.items())

@@ -82,6 +82,7 @@ _SEED = _whole(0, 2**63 - 1, 0)
 RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
     {
         "calibrate": {"seed": _SEED, "holdout": _whole(0, 100_000, 0)},
+        "camera": {"distance": Range(0, 1000, above=True, unit="m")},
         "check": {"seed": _SEED},
         "new": {"places": _whole(1, 20), **dict.fromkeys(FAMILY_DIMENSIONS, _DIMENSION)},
         "plan": {
@@ -137,7 +138,9 @@ px or grey levels, speed in m/s or rad/s, rates in 1/s, durations in s."""
 AlternativeMethod = Literal["four-step", "linear", "inverse-kinematic"]
 CalibrationMethod = Literal["bundle", AlternativeMethod]
 CameraFileFormat = Literal["opencv", "ros", "kalibr"]
-CameraModelChoice = Literal["auto", "pinhole", "fisheye", "unified"]
+CameraModelChoice = Literal[
+    "auto", "pinhole", "rational", "fisheye", "unified", "extended_unified", "double_sphere"
+]
 Paper = Literal["a", "b", "c"]
 ServoLaw = Literal["edges", "directions"]
 Style = Literal["mixed", "matte", "dark", "metal"]

@@ -58,7 +58,7 @@ def fuzz(given, place: Path) -> Summary:
     if given.telling:
         numbers = telling(numbers, bases, place)
     # quick cases do not compare all models of a camera
-    one = patch("pkmcal.camera_calibration.calibrate.DISTORTION_CANDIDATES", ("pinhole",))
+    one = patch("pkmcal.camera_calibration.calibrate.CALIBRATED_MODELS", ("pinhole",))
     with suppress(KeyboardInterrupt), one if max(numbers) < FIRST else nullcontext():
         for number in numbers:
             result = run(number, bases, place, keep=bool(given.only))

@@ -67,6 +67,8 @@ def camera(
     *,
     board: Board | Path | str | None = None,
     model: CameraModelChoice = "auto",
+    distance: float | None = None,
+    bend: bool = False,
     to: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> CameraResult:
@@ -80,7 +82,12 @@ def camera(
         The board or its file; by default the session's, or board.yaml beside the images or in the
         folder above.
     model :
-        ``pinhole``, ``fisheye`` or ``unified`` (mirrors); ``auto`` selects one.
+        Camera model; ``unified`` is for mirrors, ``auto`` selects one.
+    distance :
+        Distance of points from the camera, m, for the map of the projection's uncertainty beside
+        that at infinity; by default the median of the boards.
+    bend :
+        Estimate the board's bend, two parabolas, instead of testing it only.
     to :
         Other programs whose camera file is written as well: ``opencv``, ``ros``, ``kalibr``.
     progress :
@@ -106,7 +113,7 @@ def camera(
         )
     with whole(progress, "Reading the board") as report:
         paths, described = _images_and_board(images, board)
-        calibration = calibrate_images(paths, described, model, report)
+        calibration = calibrate_images(paths, described, model, report, distance, bend=bend)
     return CameraResult.of(calibration, images=tuple(paths), formats=tuple(dict.fromkeys(to)))
 
 

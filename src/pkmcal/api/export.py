@@ -116,8 +116,8 @@ def export(
     calibration :
         A calibration's folder, a mechanism file, or the name of a built-in machine.
     to :
-        Name of the format: ``c``, ``json``, ``klipper``, ``linuxcnc``, ``marlin``, ``mujoco``,
-        ``repetier``, ``reprap``, ``ros``, ``smoothie``, ``sdf``, ``urdf``, ``yaml``.
+        Name of the format: ``c``, ``hangprinter``, ``json``, ``klipper``, ``linuxcnc``, ``marlin``,
+        ``mujoco``, ``repetier``, ``reprap``, ``ros``, ``smoothie``, ``sdf``, ``urdf``, ``yaml``.
     session :
         The calibration's session, for its cameras, where it is not found around the folder.
     force :

@@ -5,14 +5,17 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
 from pkmcal.exporters.from_bodies import bodies_model, is_model
+from pkmcal.files import read_text
+from pkmcal.firmware.hangprinter import hangprinter_model, is_hangprinter
 from pkmcal.firmware.klipper_machines import is_klipper, klipper_model
+from pkmcal.firmware.maslow import is_maslow_log, maslow_session_texts
 from pkmcal.firmware.session import printer_session_texts
 from pkmcal.mechanisms import catalogue
 from pkmcal.outcome import Outcome, Verdict
@@ -72,7 +75,8 @@ class NewResult(Result):
     @property
     def file_list(self) -> Mapping[str, str]:
         """Files in the order in which they are to be read."""
-        words = dict(PROBED_FILE_DESCRIPTIONS if self.complete else SESSION_FILE_DESCRIPTIONS)
+        probed = self.of_printer and self.complete
+        words = dict(PROBED_FILE_DESCRIPTIONS if probed else SESSION_FILE_DESCRIPTIONS)
         if self.of_printer:
             words["mechanism.yaml"] = PRINTER_MECHANISM_DESCRIPTION
         names = [name for name in words if name in self.texts]
@@ -157,10 +161,11 @@ def new(
         does not show which it is of.
     from_file :
         MJCF, SDF, or URDF with its file of loops, all with ``tube_radius`` where known; Klipper's
-        printer.cfg of a rotary delta or a winch; or a file of a hexapod's joint centres: LinuxCNC's
-        HAL file with pins of genhexkins, or a CSV table with the columns leg, base_x, base_y,
-        base_z, platform_x, platform_y, platform_z and their units. Joint centres with ``leg``, and
-        where known ``travel`` and ``tube_radius``.
+        printer.cfg of a rotary delta or a winch, a Hangprinter's configuration with
+        RepRapFirmware's ``M669 K6``, the calibration log of a Maslow 4, or a file of a hexapod's
+        joint centres: LinuxCNC's HAL file with pins of genhexkins, or a CSV table with the columns
+        leg, base_x, base_y, base_z, platform_x, platform_y, platform_z and their units. Joint
+        centres with ``leg``, and where known ``travel`` and ``tube_radius``.
     unit :
         ``mm`` or ``inch``, of the lengths in a HAL file.
     base_radius, platform_radius :
@@ -210,6 +215,15 @@ def new(
         )
     if printer is None and probed is None and part is None:
         what = "both" if board and legs else "board" if board else "legs" if legs else None
+        if from_file is not None and is_maslow_log(text := read_text(Path(from_file))):
+            if extra := _besides(machine, unit, dimensions):
+                raise InputError(
+                    "a Maslow's log is a whole session",
+                    where="--from",
+                    found=f"{extra} besides",
+                    expected="--from FILE alone",
+                )
+            return NewResult(maslow_session_texts(text, Path(from_file).name), complete=True)
         nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
         return NewResult(
             session_texts(nominal, what, places or 1),
@@ -244,6 +258,13 @@ def new(
     return NewResult(texts, of_printer=True, complete=not board)
 
 
+def _besides(machine: Path | str | None, unit: str | None, dimensions: Mapping[str, float]) -> str:
+    """Options that were given besides a file that needs none of them; empty without any."""
+    given = {"--machine": machine, "--unit": unit}
+    names = [name for name, value in given.items() if value is not None]
+    return ", ".join([*names, *(option_of(name) for name in dimensions)])
+
+
 def _nominal(
     machine: str | None,
     from_file: Path | str | None,
@@ -273,21 +294,25 @@ def _nominal(
 
 
 def _file_model(path: Path, unit: str | None, dimensions: Mapping[str, float]) -> NominalModel:
-    """Nominal model of bodies and joints, of Klipper's configuration, or of joint centres."""
-    if is_model(path):
+    """Nominal model of bodies and joints, of a printer's configuration, or of joint centres."""
+    text = read_text(path)
+    if is_model(text):
         if unit is not None:
             raise InputError(
                 "a model of bodies is in metres", where="--unit", found=unit, expected="no --unit"
             )
         return bodies_model(path, dimensions)
-    if not is_klipper(path):
+    if is_hangprinter(text):
+        whole, model = "a Hangprinter's configuration", partial(hangprinter_model, text, path.name)
+    elif is_klipper(path):
+        whole, model = "Klipper's configuration", partial(klipper_model, path)
+    else:
         return centres_model(path, unit, dimensions)
-    if unit is not None or dimensions:
+    if extra := _besides(None, unit, dimensions):
         raise InputError(
-            "Klipper's configuration has all dimensions, in mm",
+            f"{whole} has all dimensions",
             where="--from",
-            found=" and ".join([*map(option_of, dimensions), *(["--unit"] if unit else [])])
-            + " besides",
-            expected="neither --unit nor a dimension",
+            found=f"{extra} besides",
+            expected="--from FILE alone",
         )
-    return klipper_model(path)
+    return model()

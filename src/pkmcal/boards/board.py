@@ -4,12 +4,13 @@ Board frame: x along the first count, y along the second, z into the board, as i
 corner's id is its row in :attr:`Board.points`, row by row. ChArUco: inner corners, with the origin
 at the outer corner of the first square. Chessboard: inner corners, with the origin at the first
 one. Grid of markers: four corners per marker, clockwise as printed, with the origin at the outer
-corner of the first marker.
+corner of the marker at the upper left. Grid of circles: their centres, with the origin at the
+first one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,6 +18,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.boards.kalibr import board_fields, is_kalibr_target
 from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
@@ -124,6 +126,12 @@ class GridSchema(_Dictionary):
     marker: Length = Field(description="the length of a marker's side in metres")
     gap: Length = Field(description="the distance between two markers in metres")
     first_id: Annotated[int, Field(ge=0)] = 0
+    border: Annotated[
+        int, Field(ge=1, le=2, description="modules of a marker's black border, 2 in Kalibr's")
+    ] = 1
+    leftward: Annotated[
+        bool, Field(description="ids go on from right to left, as in Kalibr's grids")
+    ] = False
     tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
 
     @field_validator("marker", "gap")
@@ -132,8 +140,29 @@ class GridSchema(_Dictionary):
         return _metres(length)
 
 
+class CircleGridSchema(Schema):
+    """Grid of circles, ``type: circle_grid``, as OpenCV has it: symmetric, or asymmetric with every
+    second row shifted by half the distance between circles of a row.
+    """
+
+    type: Literal["circle_grid"]
+    circles: Counts = Field(description="[columns, rows] of circles; asymmetric, such as [4, 11]")
+    spacing: Length = Field(
+        description="the distance between the centres of neighbouring rows in metres, and of"
+        " columns; in a row of an asymmetric grid, centres are twice as far apart"
+    )
+    asymmetric: bool = False
+    tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
+
+    @field_validator("spacing")
+    @classmethod
+    def _in_metres(cls, length: float) -> float:
+        return _metres(length)
+
+
 BOARD_SCHEMAS: dict[str, type[Schema]] = {
     "charuco": CharucoSchema, "chessboard": ChessboardSchema, "aruco_grid": GridSchema,
+    "circle_grid": CircleGridSchema,
 }  # fmt: skip
 """Schemas of board files by ``type``."""
 
@@ -142,9 +171,9 @@ BOARD_SCHEMAS: dict[str, type[Schema]] = {
 class Board:
     """Calibration board.
 
-    type : charuco, chessboard or aruco_grid.
-    counts : columns and rows of inner corners, or of markers for a grid of markers.
-    points : (N, 3) corners in the board frame by id, m.
+    type : charuco, chessboard, aruco_grid or circle_grid.
+    counts : columns and rows of inner corners, of markers or of circles.
+    points : (N, 3) corners, or circles' centres, in the board frame by id, m.
     lines : ids of corners on one straight line, at least three each.
     document : fields of board.yaml.
     """
@@ -168,11 +197,16 @@ class Board:
             return f"a grid of {columns}x{rows} markers"
         if self.type == "charuco":
             return f"a ChArUco board of {columns + 1}x{rows + 1} squares"
+        if self.type == "circle_grid":
+            kind = "an asymmetric" if self.document["asymmetric"] else "a symmetric"
+            return f"{kind} grid of {columns}x{rows} circles"
         return f"a chessboard of {columns}x{rows} inner corners"
 
     @property
     def turnable(self) -> bool:
         """Whether the board looks the same rotated by 180 degrees."""
+        if self.type == "circle_grid":
+            return not self.document["asymmetric"] or self.counts[1] % 2 == 0
         return self.type == "chessboard" and sum(self.counts) % 2 == 0
 
 
@@ -211,6 +245,8 @@ def load_board(path: Path | str, label: str | None = None) -> Board:
 
 def board_from_document(document: Document) -> Board:
     """Board from a file's fields, validated; raises InputError."""
+    if is_kalibr_target(document):
+        document = replace(document, data=board_fields(document), lines={})
     kind = document.data.get("type")
     if not isinstance(kind, str) or kind not in BOARD_SCHEMAS:
         guess = closest(str(kind), BOARD_SCHEMAS)
@@ -224,6 +260,8 @@ def board_from_document(document: Document) -> Board:
     data = fields.model_dump(mode="json", exclude_none=True)
     if kind == "aruco_grid":
         return _marker_grid(fields, data)
+    if kind == "circle_grid":
+        return _circle_grid(fields, data)
     if kind == "charuco":
         columns, rows = (n - 1 for n in fields.squares)
         return _grid(kind, (columns, rows), fields.square, (fields.square,) * 2, data)
@@ -254,15 +292,30 @@ def _marker_grid(fields: GridSchema, data: dict[str, Any]) -> Board:
     columns, rows = fields.markers
     row, column = np.mgrid[:rows, :columns].reshape(2, -1)
     side, step = fields.marker, fields.marker + fields.gap
+    column = columns - 1 - column if fields.leftward else column
     around = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * side
     xy = (np.stack([column, row], axis=-1) * step)[:, None] + around
     points = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=-1).reshape(-1, 3)
-    lines = [
+    return Board("aruco_grid", fields.markers, points, _lines(points), data)
+
+
+def _circle_grid(fields: CircleGridSchema, data: dict[str, Any]) -> Board:
+    """Board with the centres of a grid of circles."""
+    columns, rows = fields.circles
+    row, column = np.mgrid[:rows, :columns].reshape(2, -1)
+    x = 2 * column + row % 2 if fields.asymmetric else column
+    points = np.stack([x, row, 0 * row], axis=-1) * fields.spacing
+    return Board("circle_grid", fields.circles, points, _lines(points), data)
+
+
+def _lines(points: Array) -> tuple[tuple[int, ...], ...]:
+    """Ids of points (N, 3) with equal y, and with equal x, three or more."""
+    lines = (
         tuple(np.flatnonzero(points[:, axis] == value).tolist())
         for axis in (1, 0)
         for value in np.unique(points[:, axis])
-    ]
-    return Board("aruco_grid", fields.markers, points, tuple(v for v in lines if len(v) > 2), data)
+    )
+    return tuple(line for line in lines if len(line) > 2)
 
 
 def dictionaries() -> tuple[str, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from pkmcal.boards.find import (
     detect_markers,
     dictionary,
     find_chessboard,
+    narrowed,
 )
 from pkmcal.boards.layout import (
     MARKER_LAYOUT_OPTIONS,
@@ -51,6 +52,8 @@ class OtherBoardOptions:
     # width in px to which images are reduced to try many sizes of chessboards: a try takes a
     # quarter of a second, and more than one second at full size (measured)
     width: int = 512
+    # width in px to which images are reduced to search for markers of all dictionaries
+    marker_width: int = 1600
     # least relative difference between measured and described markers: corners of markers are
     # located to about half a pixel, a twentieth of the smallest markers used (derived)
     size_difference: float = 0.1
@@ -96,6 +99,7 @@ def detect_boards(
             # Check for another board before the slow methods run on all images.
             check_boards(files, detections, board, options=options)
         missed = [k for k, detection in enumerate(detections) if not detection.success]
+        missed = missed if board.type == "chessboard" else []  # markers have no slow method
         again = pool.map(
             lambda k: _detect_in_file(files[k], size, board, options.detection, quick=False), missed
         )
@@ -104,8 +108,7 @@ def detect_boards(
             text = f"Searching the rest for the board: {done} of {len(missed)} images"
             progress(text, (1 + done / len(missed)) / 2)
     check_any(detections, board)  # a different board was reported above
-    check_boards(files, detections, board, options=options)
-    return tuple(detections)
+    return check_boards(files, detections, board, options=options)
 
 
 def _detect_in_file(
@@ -142,9 +145,13 @@ def check_boards(
     detections: Sequence[Detection],
     board: Board,
     options: OtherBoardOptions = OTHER_BOARD_OPTIONS,
-) -> None:
-    """Raise `InputError` if some or all images show a board other than `board`."""
-    missed = [f for f, d in zip(files, detections, strict=True) if not d.success]
+) -> tuple[Detection, ...]:
+    """The detections; those of a few images that show a board other than `board` have it as their
+    reason.
+
+    Raises `InputError` if all images show another board, or most of them and the rest this one.
+    """
+    missed = [(f, k) for k, f in enumerate(files) if not detections[k].success]
     detected = [(f, d) for f, d in zip(files, detections, strict=True) if d.success]
     with_board = [path for path, _ in detected]
     size = detections[0].image_size
@@ -156,8 +163,10 @@ def check_boards(
         image = decode(path, size, path.name)
         if board.type == "chessboard":
             other = _larger_chessboard(image, board, options)
+        elif board.type == "circle_grid":
+            other = None  # of another grid, the detector finds no part
         else:
-            markers = detect_markers(image, dictionary(board.document["dictionary"]))
+            markers = _own_markers(image, board)
             other = _markers_beyond(image, board, markers, options)
             if other is None and board.type == "charuco":
                 _check_size(markers, board, detection, path, options)
@@ -165,13 +174,16 @@ def check_boards(
             break
     if other is not None:
         raise _other_board_error(with_board[0], other, board)
-    for path in missed[: options.images]:
-        other = other_board(
-            decode(path, size, path.name), board, part=not with_board, options=options
+    out, part = list(detections), not with_board
+    with ThreadPoolExecutor(THREADS) as pool:
+        others = pool.map(
+            lambda file: other_board(decode(file[0], size, file[0].name), board, part, options),
+            missed[: options.images],
         )
+    for (path, k), other in zip(missed, others, strict=False):
         if other is not None and not with_board:
             raise _other_board_error(path, other, board)
-        if other is not None:
+        if other is not None and len(missed) > len(with_board):
             raise InputError(
                 "images of two boards are mixed",
                 where=path.name,
@@ -179,6 +191,9 @@ def check_boards(
                 expected=f"{board.described}, as in {listed([f.name for f in with_board], 3)}",
                 next_step="Calibrate with the images of one board",
             )
+        if other is not None:
+            out[k] = replace(out[k], reason=f"it shows {other}; {out[k].reason}")
+    return tuple(out)
 
 
 def check_any(detections: Sequence[Detection], board: Board) -> None:
@@ -207,14 +222,18 @@ def _other_board_error(path: Path, other: str, board: Board) -> InputError:
     )
 
 
+def _own_markers(image: Integers, board: Board) -> Markers:
+    """Markers of the board's dictionary."""
+    border = board.document.get("border", 1)
+    return detect_markers(image, dictionary(board.document["dictionary"]), border=border)
+
+
 def _check_grid(
     paths: Sequence[Path], size: tuple[int, int], board: Board, options: OtherBoardOptions
 ) -> None:
     """Raise `InputError` if the layout of a grid's markers contradicts its file."""
-    aruco_dictionary = dictionary(board.document["dictionary"])
-    layout = marker_layout(
-        [detect_markers(decode(p, size, p.name), aruco_dictionary) for p in paths], options.layout
-    )
+    images = [_own_markers(decode(p, size, p.name), board) for p in paths]
+    layout = marker_layout(images, options.layout)
     if layout is None:
         return
     other = another_grid(layout, board, options.layout)
@@ -298,15 +317,17 @@ def other_board(
     part : whether a part of the described chessboard counts as another board, not as a partial
         detection.
     """
-    if board.type == "chessboard":
+    if board.type in ("chessboard", "circle_grid"):
         # Markers first: one search, where chessboards need one for each size.
-        return _other_markers(image, "") or _other_chessboard(image, board.counts, part, options)
+        return _other_markers(image, "", options) or _other_chessboard(
+            image, board.counts if board.type == "chessboard" else (0, 0), part, options
+        )
     name = board.document["dictionary"]
     if board.type == "charuco":
         best = _other_charuco(image, board, detect_markers(image, dictionary(name)), options)
         if best:
             return best
-    return _other_markers(image, name) or _other_chessboard(
+    return _other_markers(image, name, options) or _other_chessboard(
         image, (0, 0), part=True, options=options
     )
 
@@ -347,17 +368,12 @@ def _other_chessboard(
     """Description of a chessboard whose size is near the described one and fits; with (0, 0), of
     usual sizes.
     """
-    import cv2
-
     if counts == (0, 0):
         candidates = [(9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (6, 5), (11, 8), (10, 7), (6, 4)]
     else:
         span = range(-options.miscounts, options.miscounts + 1)
         candidates = [(counts[0] + a, counts[1] + b) for a, b in product(span, span)]
-    scale = options.width / image.shape[1]
-    if scale < 1:
-        small: Any = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        image = small
+    image, _ = narrowed(image, options.width)
     # Largest first: smaller grids are also detected inside larger ones.
     for candidate in sorted(candidates, key=lambda c: -c[0] * c[1]):
         if min(candidate) < 3 or candidate in (counts, counts[::-1]):
@@ -425,10 +441,11 @@ def _charuco_corners(
     return count, count / ((columns - 1) * (rows - 1))
 
 
-def _other_markers(image: Integers, mine: str) -> str | None:
+def _other_markers(image: Integers, mine: str, options: OtherBoardOptions) -> str | None:
     """Description of the dictionary whose markers the image shows, the smallest that contains them;
     None for too few, or if most are of the dictionary ``mine``.
     """
+    image, _ = narrowed(image, options.marker_width)
     # DICT_4X4_50 is the first 50 markers of DICT_4X4_1000: one search covers the family.
     wanted = [
         n

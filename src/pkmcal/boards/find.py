@@ -22,6 +22,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
+from pkmcal.boards.circles import circle_centres, find_circles
 from pkmcal.solver.marquardt import Damping
 from pkmcal.solver.ranks import column_space
 
@@ -59,6 +60,9 @@ class BoardDetectionOptions:
     whole_share: float = 0.75
     # width, px, from which images are tried at half their size as well
     half_size_from: int = 1000
+    # width, px, to which larger images are reduced to search for a chessboard; one way takes ten
+    # seconds on a cluttered image of twelve megapixels (measured)
+    searched_width: int = 1600
     # share of a square by which a corner may lie off the middle of its two neighbours' line
     bend: float = 0.35
 
@@ -85,6 +89,8 @@ def detect_board(
         raw, mirrored, why = _chessboard(image, board, quick, options)
     elif board.type == "charuco":
         raw, mirrored, why = _charuco(image, board, options)
+    elif board.type == "circle_grid":
+        raw, mirrored, why = _circles(image, board)
     else:
         raw, mirrored, why = _marker_grid(image, board)
     size = (image.shape[1], image.shape[0])
@@ -96,7 +102,7 @@ def detect_board(
     weak = tuple(int(i) for i in ids[~good])
     least = (
         options.whole_share * len(board.points)
-        if board.type == "chessboard"
+        if board.type in ("chessboard", "circle_grid")
         else options.least_corners
     )
     xy = board.points[ids[good], :2]
@@ -193,11 +199,13 @@ class Markers(NamedTuple):
     corners: Array
 
 
-def detect_markers(image: Integers, words: Any, quick: bool = False) -> Markers:
-    """The markers of a dictionary; quick : by the finest threshold alone."""
+def detect_markers(image: Integers, words: Any, quick: bool = False, border: int = 1) -> Markers:
+    """The markers of a dictionary; quick : by the finest threshold alone. border : its modules."""
     import cv2
 
-    corners, ids, _ = cv2.aruco.ArucoDetector(words, _thresholds(quick)).detectMarkers(image)
+    how = _thresholds(quick)
+    how.markerBorderBits = border
+    corners, ids, _ = cv2.aruco.ArucoDetector(words, how).detectMarkers(image)
     if _length(ids) == 0:
         return Markers(np.zeros(0, dtype=int), np.zeros((0, 4, 2)))
     corners = np.asarray(corners, float).reshape(-1, 4, 2)
@@ -211,12 +219,19 @@ def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     for mirrored in (False, True):
         picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
         for quick, enough in ((True, count), (False, 2)):
-            ids, corners = detect_markers(picture, words, quick)
+            ids, corners = detect_markers(picture, words, quick, data.get("border", 1))
             once = ~np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
             if once.sum() >= enough:
                 values = (4 * ids[once, None] + np.arange(4)).reshape(-1)
                 return _raw(corners[once], values, image.shape[1], mirrored), mirrored, ""
     return _raw([], [], 0, False), False, "fewer than two of the board's markers are detected"
+
+
+def _circles(image: Integers, board: Board) -> tuple[Raw, bool, str]:
+    centres = find_circles(image, board)
+    if centres is None:
+        return _raw([], [], 0, False), False, f"{board.described} is not detected"
+    return (np.arange(len(centres)), centres), False, ""
 
 
 def _chessboard(
@@ -259,8 +274,9 @@ def _attempts(
             lambda p=picture: cv2.findChessboardCornersSB(p, counts, flags=thorough),
             lambda p=picture: cv2.findChessboardCorners(p, counts, flags=adaptive),
         ]
-        # Enlarged, the second way takes seconds on a cluttered picture.
-        for attempt in ways[:1] if quick or scale > 1 else ways:
+        # On a large cluttered picture the second way takes seconds.
+        large = picture.shape[1] > options.searched_width
+        for attempt in ways[:1] if quick or large else ways:
             value, corners = attempt()
             if value and _length(corners) == counts[0] * counts[1]:
                 pixels = np.asarray(corners, dtype=float).reshape(-1, 2)
@@ -273,13 +289,24 @@ def _pictures(
     """The image; with its contrast evened out; smaller; larger; each with its scale."""
     import cv2
 
-    yield image, 1.0
+    image, scale = narrowed(image, options.searched_width)
+    yield image, scale
     if quick:
         return
-    yield cv2.createCLAHE(3.0, (8, 8)).apply(image), 1.0
+    yield cv2.createCLAHE(3.0, (8, 8)).apply(image), scale
     if image.shape[1] > options.half_size_from:
-        yield cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 0.5
-    yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0
+        yield cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 0.5 * scale
+    yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0 * scale
+
+
+def narrowed(image: Integers, width: int) -> tuple[Any, float]:
+    """Image reduced to a width in px at most, and its scale, 1 for a narrower image."""
+    import cv2
+
+    scale = width / image.shape[1]
+    if scale >= 1:
+        return image, 1.0
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
 
 
 def _is_grid(grid: Array, options: BoardDetectionOptions) -> bool:
@@ -332,8 +359,11 @@ def _fitted(image: Integers, board: Board, raw: Raw, options: BoardDetectionOpti
     """The corners' fits; a grid of markers may have plain corners or touching dark squares."""
     ids, pixels = raw
     data = board.document
+    if board.type == "circle_grid":
+        centres, good, sigma = circle_centres(image, board, pixels)
+        return Corners(centres, good, sigma, np.zeros((len(ids), 7)))
     if board.type == "aruco_grid":
-        module = 1 / (marker_bits(data["dictionary"]) + 2)
+        module = 1 / (marker_bits(data["dictionary"]) + 2 * data.get("border", 1))
         reach = min(options.reach, 0.8 * data["gap"] / data["marker"])
         axes = _marker_axes(ids, pixels)
         plain = refine(

@@ -153,13 +153,13 @@ class CameraProblem:
         )
 
     def retract(self, state: CameraState, shared: Array, own: Array) -> CameraState:
-        """The state after a step; xi stays at 0 or above."""
+        """The state after a step; the model's own fields stay in their ranges."""
         intrinsics = state.intrinsics
         if len(self.free):
             intrinsics = intrinsics + shared
-            if "xi" in self.camera.parameter_names:
-                xi = self.free == self.camera.parameter_names.index("xi")
-                intrinsics[:, xi] = np.maximum(intrinsics[:, xi], 0.0)
+            shape = (self.free >= 4) & (self.free < 4 + len(self.camera.own))
+            low, high = self.camera.own_range()[:, self.free[shape] - 4]
+            intrinsics[:, shape] = np.clip(intrinsics[:, shape], low, high)
         return CameraState(intrinsics, perturb(state.T_camera_board, own))
 
     def select(self, runs: Integers) -> CameraProblem:
@@ -266,21 +266,28 @@ def fit_board_poses(
     return solution.state.T_camera_board[:, 0], solution.cost
 
 
-def covariance_of(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
+def covariance_of(
+    fit: CameraFit, views: Views, beside: Array | None = None
+) -> tuple[Array, Array, Array]:
     """Covariances at a fit: intrinsics (n, n), zero where not free; poses (V, 6, 6); and the
     poses' derivative by the intrinsics (V, 6, n).
+
+    beside : (V, 2 N, k) rows of further unknowns of the fit.
     """
     linear = fit.problem(views).linearize(fit.state)
-    n = len(fit.camera.parameters)
+    n, k = len(fit.camera.parameters), 0 if beside is None else beside.shape[-1]
+    if beside is not None:
+        shared = np.concatenate([linear.by_shared[0], beside], axis=-1)[None]
+        linear = linear._replace(by_shared=shared, shared_by=np.zeros((0, shared.shape[-1])))
     reduced = eliminate(linear)
     inner = np.linalg.inv(reduced.r[0] + 1e-150 * np.eye(6))
-    whole, by = np.zeros((n, n)), np.zeros((len(fit.T_camera_board), 6, n))
+    whole, by = np.zeros((n + k, n + k)), np.zeros((len(fit.T_camera_board), 6, n + k))
     if len(fit.free):
-        rows = reduced.rows[0]
-        whole[np.ix_(fit.free, fit.free)] = inverted((rows.mT @ rows).sum(axis=0))
-        by[..., fit.free] = -inner @ (reduced.q[0].mT @ linear.by_shared[0])
+        rows, free = reduced.rows[0], np.append(fit.free, n + np.arange(k))
+        whole[np.ix_(free, free)] = inverted((rows.mT @ rows).sum(axis=0))
+        by[..., free] = -inner @ (reduced.q[0].mT @ linear.by_shared[0])
     poses = inner @ inner.mT + by @ whole @ by.mT
-    return whole, poses, by
+    return whole[:n, :n], poses, by[..., :n]
 
 
 def inverted(normal: Array) -> Array:

@@ -60,7 +60,7 @@ class MarkerLayout:
         """Number of row neighbours that are in different rows if the first marker has this id."""
         columns = abs(self.down)
         pairs = self.within_rows.items()
-        return sum(n for (_, right), n in pairs if (right - first) % columns == 0)
+        return sum(n for pair, n in pairs if (max(pair) - first) % columns == 0)
 
     def first_ids(self) -> list[int]:
         """Possible ids of the first marker, largest first: they begin a row and are not above any
@@ -116,11 +116,12 @@ def another_grid(
     """
     columns, rows = board.counts
     first, count = board.document.get("first_id", 0), columns * rows
-    if rows > 1 and layout.along == 1 and layout.down > 1 and layout.down != columns:
+    along = -1 if board.document.get("leftward", False) else 1
+    if rows > 1 and layout.along == along and layout.down > 1 and layout.down != columns:
         wide = layout.down
         high = count // wide if count % wide == 0 else -(-(max(layout.ids) + 1 - first) // wide)
         return f"a grid of {wide}x{high} markers"
-    if columns > 1 and rows > 1 and (layout.along, layout.down) != (1, columns):
+    if columns > 1 and rows > 1 and (layout.along, layout.down) != (along, columns):
         return (
             f"markers whose ids go on by {layout.along:+d} to the right and by {layout.down:+d}"
             " downward"

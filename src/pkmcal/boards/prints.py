@@ -80,6 +80,14 @@ class Print:
             i, j = np.mgrid[:rows, :columns]
             edges = [data["square"] * (np.arange(n + 1) - 1.0) for n in (columns, rows)]
             return cls(edges[0], edges[1], (i + j) % 2 == 0)
+        if board.type == "circle_grid" or data.get("border", 1) > 1:
+            raise InputError(
+                "boards of this kind are not printed",
+                found=board.described,
+                expected="a ChArUco board, a chessboard or a grid of markers with a border of one"
+                " module",
+                next_step="Print it with the program that it is from",
+            )
         return _charuco(data) if board.type == "charuco" else _markers(data)
 
     def dark_at(self, x: Array, y: Array) -> Booleans:

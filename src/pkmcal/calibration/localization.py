@@ -18,6 +18,9 @@ from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.levels import MAJORITY
 from pkmcal.measurements.contract import LinkKind, kinds_of
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_error, reversed_motor
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
@@ -35,7 +38,7 @@ from pkmcal.session.readings import frozen
 from pkmcal.wording import listed
 
 ALLOWED_LEG_MISS = 2.0
-"""Prior sigmas of a centre by which legs may miss the platform at the nearest nominal pose."""
+"""Prior sigmas by which legs may miss the platform at the nearest nominal pose."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +118,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     except GeometryError as error:  # the nominal model is the user's: it is at fault
         raise error.as_input(session.document["mechanism"]) from None
     # near the ends of its workspace a nominal model that is right to its tolerance may not close
-    near = fk.error < ALLOWED_LEG_MISS * session.machine.document.tolerance.center
+    near = fk.error < _allowed_leg_miss(session.machine, fk)
     if near.all() or (most and near.mean() > MAJORITY):
         _check_turns(session, fk.T_base_platform, near)
         return fk.T_base_platform
@@ -160,16 +163,29 @@ def _check_columns(session: Session, bad: list[str]) -> None:
 
 
 def _closing_misfit(session: Session, joints: Array) -> float:
-    """Root mean square by which legs miss the platform at readings (K, m), in ALLOWED_LEG_MISS
-    prior sigmas, no configuration by more than ``VerdictOptions.too_noisy``; where the platform
-    turns further than its parts allow, by that.
+    """Root mean square by which legs miss the platform at readings (K, m), relative to
+    :func:`_allowed_leg_miss`, no configuration by more than ``VerdictOptions.too_noisy``; where the
+    platform turns further than its parts allow, by that.
     """
     machine = session.machine
     fk = machine.forward_result(joints)
-    miss = fk.error / (ALLOWED_LEG_MISS * machine.document.tolerance.center)
+    miss = fk.error / _allowed_leg_miss(machine, fk)
     blocked = np.abs(_turn(fk.T_base_platform)) > machine.most_turn[0]
     miss = np.where(blocked | ~(miss < VERDICT.too_noisy), VERDICT.too_noisy, miss)
     return float(np.sqrt(np.mean(miss**2)))
+
+
+def _allowed_leg_miss(machine: Machine, fk: ForwardResult) -> Array:
+    """Largest closure error (K,), m, at readings of a machine that differs by its prior sigmas.
+
+    More rods than freedoms meet only in the true geometry: each misses by its own errors.
+    """
+    table = machine.parameters
+    if not machine.layout.overdetermined:
+        return np.full(len(fk.error), ALLOWED_LEG_MISS * machine.document.tolerance.center)
+    c = closure(machine.layout, machine.values, fk.readings, fk.T_base_platform, fk.internal)
+    by_prior = dense(c, len(table)) @ (table.free_matrix() * table.tolerances_free())
+    return ALLOWED_LEG_MISS * np.linalg.norm(by_prior, axis=-1).max(axis=-1)
 
 
 def _turn(poses: Array) -> Array:

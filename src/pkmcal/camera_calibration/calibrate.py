@@ -19,10 +19,12 @@ from pkmcal.boards.fit import (
     Views,
     check_numbering,
     covariance_of,
+    fit_camera,
     views_of,
 )
+from pkmcal.boards.shape import BoardDeviation, bend_of, board_columns, deviation, rows_of
 from pkmcal.camera_calibration.model_selection import (
-    DISTORTION_CANDIDATES,
+    CALIBRATED_MODELS,
     MODEL_SELECTION_OPTIONS,
     Candidate,
     HeldOut,
@@ -35,11 +37,18 @@ from pkmcal.camera_calibration.model_selection import (
     spread_of_views,
     thinned,
 )
+from pkmcal.camera_calibration.uncertainty import (
+    BoardMotion,
+    board_motion,
+    largest_sigma,
+    pixel_grid,
+    projection_covariance,
+)
 from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError, ResultError
-from pkmcal.files import closest
-from pkmcal.geometry.rigid import dot
-from pkmcal.levels import MAJORITY
+from pkmcal.files import closest, json_value
+from pkmcal.geometry.rigid import apply, dot
+from pkmcal.levels import MAJORITY, NEGLIGIBLE
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.solver.kernels import INLIER_WEIGHT
@@ -68,6 +77,10 @@ class CalibrationCheckOptions:
     # tilt of a board in degrees below which views all have the same information on the focal
     # length, which is little
     facing_tilt: float = 15.0
+    # most steps in which a board's bend and the rest are estimated in turn; two or three suffice
+    bend_steps: int = 10
+    # probability by chance below which a deviation of the board from its file is reported
+    deviation_alpha: float = 1e-3
     # columns and rows of cells by which the coverage of the image is counted
     cells: tuple[int, int] = (8, 6)
     # share of cells with corners below which a warning is given
@@ -78,6 +91,8 @@ class CalibrationCheckOptions:
 
 
 CALIBRATION_CHECK_OPTIONS = CalibrationCheckOptions()
+UNCERTAINTY_CELLS = (32, 24)
+"""Columns and rows of cells in which the projection's uncertainty is computed."""
 STRONG_CORRELATION = 0.95
 """Correlation from which two intrinsics are reported as hardly separable."""
 
@@ -92,6 +107,7 @@ class CameraCalibration:
     views : names of the V images used.
     T_camera_board : (V, 4, 4) m.
     pose_covariance : (V, 6, 6), left perturbation, with the intrinsics' uncertainty.
+    motion : mean motion of the boards, for the projection's uncertainty.
     pixels : (V, N, 2) detected corners, NaN where not detected.
     residuals : (V, N, 2) px, predicted minus detected.
     weight : (V, N) IRLS weights, 0 to 1.
@@ -99,6 +115,9 @@ class CameraCalibration:
     rms, held_out : px, root mean square of the residuals' lengths, on the views used, and on views
         held out of the estimate of the camera (their poses are fitted).
     compared : all candidate models and sets of coefficients.
+    bend : estimated bend of the board; None if it is taken to be flat.
+    deviations : of the board from its file, tested only.
+    distance : m, of the projection's uncertainty that is not at infinity.
     """
 
     camera: Camera
@@ -108,6 +127,7 @@ class CameraCalibration:
     views: tuple[str, ...]
     T_camera_board: Array
     pose_covariance: Array
+    motion: BoardMotion
     pixels: Array
     residuals: Array
     weight: Array
@@ -117,6 +137,9 @@ class CameraCalibration:
     compared: tuple[Candidate, ...]
     board: Board
     detections: tuple[Detection, ...]
+    bend: BoardDeviation | None
+    deviations: tuple[BoardDeviation, ...]
+    distance: float
     findings: tuple[Finding, ...]
 
     @property
@@ -128,6 +151,22 @@ class CameraCalibration:
     def sigma(self) -> Array:
         """Standard deviations (n,) of the intrinsics, 0 for those not estimated."""
         return np.sqrt(np.diag(self.covariance))
+
+    def projection_sigma(self, pixels: Array, distance: float = np.inf) -> Array:
+        """Standard deviation (...) px of the pixels of fixed points, in the worst direction.
+
+        pixels : (..., 2). distance : m, of the points from the camera. NaN for pixels without a
+        ray.
+        """
+        return largest_sigma(
+            projection_covariance(self.camera, self.covariance, self.motion, pixels, distance)
+        )
+
+    def projection_map(self, distance: float) -> Array:
+        """``projection_sigma`` in the middles of the image's cells, (rows, columns)."""
+        return self.projection_sigma(
+            pixel_grid(self.camera.image_size, UNCERTAINTY_CELLS), distance
+        )
 
     @property
     def inliers(self) -> Booleans:
@@ -148,6 +187,11 @@ class CameraCalibration:
         ]
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
+    def correlated_with(self, name: str) -> list[str]:
+        """Intrinsics that are determined only together with ``name``, with the correlations."""
+        pairs = [pair for pair in self.correlations if name in pair]
+        return [f"{a if b == name else b} ({rho:+.3f})" for a, b, rho in pairs]
+
     def as_dict(self) -> dict[str, Any]:
         """Calibration as plain data for JSON, with the camera as in its file."""
         names = self.camera.parameter_names
@@ -160,6 +204,13 @@ class CameraCalibration:
                 )
             ],
             "covariance": self.covariance.tolist(),
+            "projection_sigma": [
+                {
+                    "distance": distance,
+                    "sigma": json_value(self.projection_map(distance or np.inf)),
+                }
+                for distance in (None, self.distance)
+            ],
             "views_disagree_by": self.spread,
             "rms": self.rms,
             "held_out_rms": self.held_out.rms,
@@ -181,6 +232,8 @@ class CameraCalibration:
             ],
             "not_used": {d.name: d.reason for d in self.detections if not d.success},
             "board": self.board.document,
+            "board_bend": None if self.bend is None else _deviation_document(self.bend),
+            "board_deviations": {one.code: _deviation_document(one) for one in self.deviations},
             "warnings": list(self.warnings),
             "findings": [one.document() for one in self.findings],
         }
@@ -191,12 +244,15 @@ def calibrate_images(
     board: Board,
     model: str = "auto",
     progress: Progress = no_progress,
+    distance: float | None = None,
+    *,
+    bend: bool = False,
 ) -> CameraCalibration:
     """Detect the board in images of one size and calibrate their camera."""
     _check_model_name(model)
     detections = detect_boards(paths, board, progress=part(progress, 0, 0.6))
     progress("Calibrating the camera", 0.6)
-    return calibrate_camera(detections, board, model)
+    return calibrate_camera(detections, board, model, distance=distance, bend=bend)
 
 
 def calibrate_camera(
@@ -204,10 +260,14 @@ def calibrate_camera(
     board: Board,
     model: str = "auto",
     options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
+    distance: float | None = None,
+    *,
+    bend: bool = False,
 ) -> CameraCalibration:
     """Calibrate a camera from detected corners.
 
-    model : pinhole, fisheye, unified, or auto.
+    model : a camera model's name, or auto. distance : m, of points whose projection's uncertainty
+    is computed; by default the median of the boards' middles. bend : estimate the board's bend.
     Raises `InputError` if the views are too few or `model` does not fit, and `ResultError` if the
     views do not determine the camera.
     """
@@ -216,18 +276,18 @@ def calibrate_camera(
     check_enough(used, len(detections), options=options)
     image_size = used[0].image_size
     views = views_of(used, board)
-    # Choose the model and its coefficients on a subset of the corners.
-    selection = options.selection
-    pool = camera_candidates(thinned(views, selection), image_size, selection.models, selection)
-    mine = tuple(c for c in pool if model in ("auto", c.model))
-    if not mine:
-        raise no_fit(model, pool)
-    chosen = best_of(mine, selection)
+    selection, bent = options.selection, None
+    pool, chosen, fit = _selected_fit(views, image_size, model, selection)
+    if bend:
+        fit, views, bent = _bent_board(fit, views, board, None, options)
+        # The bend hides coefficients of the lens, which are selected again.
+        pool, chosen, fit = _selected_fit(views, image_size, model, selection)
+        fit, views, bent = _bent_board(fit, views, board, bent, options)
     model_warnings = check_model(model, chosen, best_of(pool, selection), options=options)
-    # Fit all corners, with the covariance scaled by the disagreement of the views.
-    fit = fitted_to_all(chosen, views)
     check_corners(fit, views, board, options=options)
-    by_noise, poses_by_noise, _ = covariance_of(fit, views)
+    # Covariance, scaled by the disagreement of the views.
+    beside = rows_of(fit, views, bend_of(board)) if bend else None
+    by_noise, poses_by_noise, by_intrinsics = covariance_of(fit, views, beside)
     spread = spread_of_views(fit, views, selection)
     covariance = by_noise * spread**2
     check_determined(fit, covariance, views, options=options)
@@ -236,6 +296,11 @@ def calibrate_camera(
     check_explained(tested.rms, fit.camera, options)
     inliers = (fit.weight >= INLIER_WEIGHT) & views.visible
     lengths = np.sum(np.nan_to_num(fit.residuals) ** 2, axis=-1)
+    deviations = tuple(
+        deviation(fit, views, column)
+        for column in board_columns(board)
+        if not (bend and column.code == "bend")
+    )
     calibration = CameraCalibration(
         camera=replace(fit.camera, covariance=covariance),
         terms=chosen.terms,
@@ -244,6 +309,9 @@ def calibrate_camera(
         views=tuple(detection.name for detection in used),
         T_camera_board=fit.T_camera_board,
         pose_covariance=poses_by_noise * spread**2,
+        motion=board_motion(
+            fit.T_camera_board, poses_by_noise * spread**2, by_intrinsics, covariance
+        ),
         pixels=views.pixels,
         residuals=fit.residuals,
         weight=fit.weight,
@@ -253,6 +321,9 @@ def calibrate_camera(
         compared=pool,
         board=board,
         detections=tuple(detections),
+        bend=bent,
+        deviations=deviations,
+        distance=distance or _median_distance(fit.T_camera_board, views.points),
         findings=(),
     )
     return replace(
@@ -260,15 +331,81 @@ def calibrate_camera(
     )
 
 
+def _deviation_document(one: BoardDeviation) -> dict[str, Any]:
+    """Amplitudes of a board's deviation as plain data, m, or relative for a stretch."""
+    sigma = np.sqrt(np.diag(one.covariance))
+    return {"value": one.value.tolist(), "sigma": sigma.tolist(), "chance": one.chance}
+
+
+def _selected_fit(
+    views: Views, image_size: tuple[int, int], model: str, options: ModelSelectionOptions
+) -> tuple[tuple[Candidate, ...], Candidate, CameraFit]:
+    """All candidates and the selected one, on a subset of the corners, and its fit to all corners.
+
+    Raises InputError if a named model has no fit.
+    """
+    pool = camera_candidates(thinned(views, options), image_size, options.models, options)
+    mine = tuple(c for c in pool if model in ("auto", c.model))
+    if not mine:
+        raise no_fit(model, pool)
+    chosen = best_of(mine, options)
+    return pool, chosen, fitted_to_all(chosen, views)
+
+
+def _bent_board(
+    fit: CameraFit,
+    views: Views,
+    board: Board,
+    before: BoardDeviation | None,
+    options: CalibrationCheckOptions,
+) -> tuple[CameraFit, Views, BoardDeviation]:
+    """Fit with the board's bend, which is estimated in turn with the rest.
+
+    before : the bend of ``views.points``; None for a flat board.
+    """
+    column, value = bend_of(board), np.zeros(2) if before is None else before.value
+    step = deviation(fit, views, column)
+    for _ in range(options.bend_steps):
+        value = value + step.value
+        points = board.points + np.tensordot(value, column.displacement, axes=1)
+        views = views._replace(points=points)
+        fit = fit_camera(fit.camera, fit.free, views, fit.T_camera_board)
+        step = deviation(fit, views, column)
+        if np.all(np.abs(step.value) < NEGLIGIBLE * np.sqrt(np.diag(step.covariance))):
+            break
+    return fit, views, step._replace(value=value)
+
+
+def _median_distance(T_camera_board: Array, points: Array) -> float:
+    """Median distance of boards' middles from the camera, m."""
+    middles = apply(T_camera_board, points.mean(axis=0))
+    return float(np.median(np.linalg.norm(middles, axis=-1)))
+
+
 def _check_model_name(model: str) -> None:
     """Raise InputError for an unknown camera model."""
-    models = ("auto", *DISTORTION_CANDIDATES)
+    models = ("auto", *CALIBRATED_MODELS)
     if model not in models:
         raise InputError(
             "no such camera model",
             found=model,
             expected=closest(model, models) or listed(models),
         )
+
+
+def _deviation_findings(
+    c: CameraCalibration, options: CalibrationCheckOptions
+) -> Iterator[Finding]:
+    """Warnings about a board that deviates from its file."""
+    for one in c.deviations:
+        if one.chance < options.deviation_alpha:
+            largest = int(np.argmax(np.abs(one.value)))
+            yield doubtful(
+                f"lens.board_{one.code}",
+                value=float(one.value[largest]),
+                sigma=float(np.sqrt(one.covariance[largest, largest])),
+                focal_shift=float(np.mean(one.focal_shift)),
+            )
 
 
 def check_enough(
@@ -439,6 +576,7 @@ def calibration_findings(
         yield doubtful("lens.some_mirrored", listed(mirrored), names=mirrored)
     elif mirrored:
         yield doubtful("lens.all_mirrored", number=len(mirrored), first=mirrored[0])
+    yield from _deviation_findings(c, options)
     if c.spread > 1:
         yield doubtful("lens.views_disagree", scale=c.spread)
     most = float(tilts(c.T_camera_board, c.board.points).max())
@@ -455,9 +593,9 @@ def calibration_findings(
     for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True):
         if rms > options.outlying_view * middle:
             yield doubtful("lens.odd_view", name, scale=rms / middle)
-    # intrinsics that are determined only together with xi
-    others = [
-        f"{a if b == 'xi' else b} ({rho:+.3f})" for a, b, rho in c.correlations if "xi" in (a, b)
-    ]
-    if c.camera.model == "unified" and others:
-        yield doubtful("lens.xi_correlated", others=others)
+    tied = {name: c.correlated_with(name) for name in c.camera.own}
+    yield from (
+        doubtful("lens.own_correlated", name, others=others)
+        for name, others in tied.items()
+        if others
+    )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
@@ -24,15 +25,15 @@ from pkmcal.boards.fit import (
     refit,
     settled_poses,
 )
-from pkmcal.cameras.contract import Camera, camera_models
+from pkmcal.cameras.contract import CENTER, FOCAL, Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.levels import NEGLIGIBLE
+from pkmcal.ranges import CameraModelChoice
 from pkmcal.solver.elimination import eliminate
 from pkmcal.solver.kernels import INLIER_WEIGHT, NO_WEIGHT_DISTANCE
 
-FOCAL_RANGES = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
-"""Range of starting values for the pixels per radian at the image's centre, as a share of its
-width."""
+CALIBRATED_MODELS: tuple[str, ...] = get_args(CameraModelChoice)[1:]
+"""Camera models in the order of preference among equals."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,9 @@ class ModelSelectionOptions:
     """Constants of the selection of a camera model and its coefficients."""
 
     # camera models that are compared, a requested one among them
-    models: tuple[str, ...] = ("pinhole", "fisheye", "unified")
+    models: tuple[str, ...] = CALIBRATED_MODELS
     # focal lengths of the grid, in geometric steps over the range
     focals: int = 16
-    # values of xi of the grid
-    xis: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.2)
     # number of best starting values that are refined
     starts: int = 3
     # IRLS rounds of this refinement
@@ -63,28 +62,22 @@ class ModelSelectionOptions:
     least_rays: int = 4
     # fewest corners kept of each view, if it has as many
     least_of_view: int = 12
-    # ratio of residuals to another model's, with two radial terms, above which no more terms are
-    # tried
+    # ratio of residuals to another model's, with so many radial terms, above which no more terms
+    # are tried
     hopeless_ratio: float = 5.0
+    hopeless_terms: int = 2
+    # median residual, px, up to which a model is not hopeless: tangential terms alone may be
+    # missing, of which sharp images show hundredths of a pixel
+    hopeless_residual: float = 0.5
 
 
 MODEL_SELECTION_OPTIONS = ModelSelectionOptions()
 
-DISTORTION_CANDIDATES: dict[str, tuple[tuple[str, ...], ...]] = {
-    "pinhole": (
-        (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
-    ),
-    "fisheye": ((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3"), ("k1", "k2", "k3", "k4")),
-    "unified": ((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
-}  # fmt: skip
-"""Sets of distortion coefficients by model, from few to many; the first of equal ones wins."""
-
 
 def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers:
-    """Indices of the free intrinsics: focal lengths, centre, xi if present, and ``terms``."""
-    base = ("focal.x", "focal.y", "center.x", "center.y", "xi")
-    names = camera.parameter_names
-    return np.array([k for k, name in enumerate(names) if name in base or name in terms])
+    """Indices of the free intrinsics: focal lengths, centre, the model's own, and ``terms``."""
+    base, names = 4 + len(camera.own), camera.parameter_names
+    return np.array([k for k, name in enumerate(names) if k < base or name in terms])
 
 
 def first_fit(
@@ -127,18 +120,18 @@ def starting_cameras(
     image_size: tuple[int, int],
     options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS,
 ) -> Iterator[Camera]:
-    """Starting values of a model without distortion: a grid of focal lengths, and of xi."""
+    """Starting values of a model without distortion: a grid of focal lengths and own fields."""
     width, height = image_size
     kind = camera_models()[model]
-    names = kind.parameter_names
-    for scale in np.geomspace(*FOCAL_RANGES[model], options.focals):
-        for xi in options.xis if "xi" in names else (0.0,):
-            parameters = dict.fromkeys(names, 0.0)
-            parameters["focal.x"] = parameters["focal.y"] = float(scale) * width * (1 + xi)
-            parameters["center.x"], parameters["center.y"] = (width - 1) / 2, (height - 1) / 2
-            if "xi" in names:
-                parameters["xi"] = xi
-            yield kind(image_size, np.array([parameters[name] for name in names]))
+    for scale in np.geomspace(*kind.search.focal_range, options.focals):
+        for own in kind.search.own:
+            parameters = np.zeros(len(kind.parameter_names))
+            # with xi the image at the centre is smaller by 1 + xi
+            xi = dict(zip(kind.own, own, strict=True)).get("xi", 0.0)
+            parameters[FOCAL] = float(scale) * width * (1 + xi)
+            parameters[CENTER] = (width - 1) / 2, (height - 1) / 2
+            parameters[4 : 4 + len(own)] = own
+            yield kind(image_size, parameters)
 
 
 @dataclass(frozen=True)
@@ -294,17 +287,18 @@ def camera_candidates(
     are missing.
     """
     fits: list[tuple[str, tuple[str, ...], CameraFit]] = []
-    # The unified model first: it fits almost any lens, and shows which other models are hopeless.
-    for model in sorted(models, key=list(DISTORTION_CANDIDATES).index, reverse=True):
+    # Models for wide lenses first: they fit almost any lens, and show which others are hopeless.
+    for model in sorted(models, key=CALIBRATED_MODELS.index, reverse=True):
         start = first_fit(model, views, image_size, options=options)
         if start is None:
             continue
-        for terms in DISTORTION_CANDIDATES[model]:
+        for terms in camera_models()[model].search.terms:
             fit = extended(start, views, terms)
             fits.append((model, terms, fit))
-            if "k2" in terms and _median_residual(fit) > options.hopeless_ratio * min(
-                _median_residual(f) for _, _, f in fits
-            ):
+            radial = sum(name.startswith("k") for name in terms)
+            best_residual = min(_median_residual(f) for _, _, f in fits)
+            hopeless = max(options.hopeless_ratio * best_residual, options.hopeless_residual)
+            if radial >= options.hopeless_terms and _median_residual(fit) > hopeless:
                 break
             # a larger set starts from this fit
             start = fit if "k1" in terms else start
@@ -335,14 +329,14 @@ def camera_candidates(
             fits, held_out_residuals, bounded, strict=True
         )
     ]
-    return tuple(sorted(pool, key=lambda c: list(DISTORTION_CANDIDATES).index(c.model)))
+    return tuple(sorted(pool, key=lambda c: CALIBRATED_MODELS.index(c.model)))
 
 
 def best_of(
     pool: tuple[Candidate, ...], options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS
 ) -> Candidate:
-    """Simplest candidate among those not significantly worse than the best: one without xi before
-    one with it, then the one with the fewest parameters.
+    """Simplest candidate among those not significantly worse than the best: a model without fields
+    of its own (xi, alpha, beta) before one with them, then the one with the fewest parameters.
 
     On a narrow lens xi replaces k1 and k2, but the data determine it only together with the focal
     length, which may then be several times the lens's.
@@ -350,7 +344,7 @@ def best_of(
     best = min(pool, key=lambda c: c.robust)
     return min(
         (c for c in pool if not is_worse(c, best, options=options)),
-        key=lambda c: ("xi" in c.fit.camera.own, c.parameters),
+        key=lambda c: (bool(c.fit.camera.own), c.parameters),
     )
 
 

@@ -32,6 +32,11 @@ LEAST_FOCAL = 0.05
 all of its 180 degrees in the image has a third, a mirror a fifth."""
 
 
+FIELD_MARGIN = 1e-9
+"""Margin, as a difference of cosines, between valid rays and the border of the field, where image
+points go to infinity; for a bound of one of a model's own fields that the field does not reach, the
+margin to this bound."""
+
 FOCAL, CENTER, PIXEL_PARAMETERS = slice(0, 2), slice(2, 4), slice(0, 4)
 """Parameters of every model: the focal lengths, the principal point, and both, which are in
 pixels."""
@@ -77,6 +82,19 @@ stand for a zoom ring turned by a hair, pixels square to a thousandth, a sensor 
 and the distortion of most lenses."""
 
 
+class LensSearch(NamedTuple):
+    """Starting values and sets of distortion coefficients by which a model is calibrated.
+
+    focal_range : of the pixels per radian at the image's centre, as a share of its width.
+    terms : sets of free distortion coefficients, from few to many; the first of equal ones wins.
+    own : starting values of the model's own fields.
+    """
+
+    focal_range: tuple[float, float]
+    terms: tuple[tuple[str, ...], ...]
+    own: tuple[tuple[float, ...], ...] = ((),)
+
+
 class LensViolation(NamedTuple):
     """Model violation of a camera file by k numbers, the amplitudes.
 
@@ -100,7 +118,8 @@ class Camera(ABC):
     parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
         center, none for the rest. Pixel centres are at integers, as in OpenCV.
     own : fields of the model's file between ``center`` and ``distortion``. odd : names of the
-        parameters whose sign changes when the image is rotated by 180 degrees.
+        parameters whose sign changes when the image is rotated by 180 degrees. search : starting
+        values for a calibration.
     """
 
     model: ClassVar[str]
@@ -108,6 +127,7 @@ class Camera(ABC):
     schema: ClassVar[type[CameraSchema]]
     own: ClassVar[tuple[str, ...]] = ()
     odd: ClassVar[tuple[str, ...]] = ()
+    search: ClassVar[LensSearch]
 
     image_size: tuple[int, int]
     parameters: Array
@@ -174,6 +194,17 @@ class Camera(ABC):
         k = np.zeros(len(cls.parameter_names) - 4 - len(own))
         k[: len(document.distortion)] = document.distortion
         return cls(document.image_size, np.concatenate([document.focal, document.center, own, k]))
+
+    @classmethod
+    def own_range(cls) -> Array:
+        """Bounds (2, k) of the model's own fields, from its ``schema``."""
+        bounds = np.array([[-np.inf], [np.inf]]).repeat(len(cls.own), axis=1)
+        for k, name in enumerate(cls.own):
+            for limit in cls.schema.model_fields[name].metadata:
+                low, above = getattr(limit, "ge", -np.inf), getattr(limit, "gt", -np.inf)
+                bounds[0, k] = max(bounds[0, k], low, above + FIELD_MARGIN)
+                bounds[1, k] = min(bounds[1, k], getattr(limit, "le", np.inf))
+        return bounds
 
     @property
     def focal(self) -> Array:

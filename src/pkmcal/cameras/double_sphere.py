@@ -13,12 +13,9 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.cameras.contract import Camera, CameraSchema
+from pkmcal.cameras.contract import FIELD_MARGIN, Camera, CameraSchema, LensSearch
 from pkmcal.cameras.quotient import field_cosine, quotient_jacobians, quotient_pixels
 from pkmcal.geometry.rigid import dot
-
-_LEAST = 1e-9
-"""Margin, as a difference of cosines, between valid rays and the border of the field."""
 
 
 class DoubleSphereSchema(CameraSchema):
@@ -47,6 +44,11 @@ class DoubleSphere(Camera):
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "xi", "alpha",
     )  # fmt: skip
+    search: ClassVar[LensSearch] = LensSearch(
+        focal_range=(0.12, 2.0),
+        terms=((),),
+        own=((-0.2, 0.5), (-0.2, 0.6), (0.2, 0.6), (0.6, 0.6), (0.9, 0.5), (0.9, 0.1)),
+    )
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN outside the field of view."""
@@ -75,7 +77,7 @@ class DoubleSphere(Camera):
             z = (1 - alpha**2 * r2) / (alpha * np.sqrt(1 - (2 * alpha - 1) * r2) + 1 - alpha)
             scale = (z * xi + np.sqrt(z * z + (1 - xi**2) * r2)) / (z * z + r2)
         rays = np.concatenate([scale[..., None] * m, (scale * z - xi)[..., None]], axis=-1)
-        inside = rays[..., 2] > (_LEAST - self._border())
+        inside = rays[..., 2] > (FIELD_MARGIN - self._border())
         return np.where(inside[..., None], rays, np.nan)
 
     def _border(self) -> float:
@@ -91,7 +93,7 @@ class DoubleSphere(Camera):
         """
         xi, alpha = self.parameters[4:].tolist()
         d1 = np.sqrt(dot(points, points))
-        good = (d1 > 0) & (points[..., 2] > (_LEAST - self._border()) * d1)
+        good = (d1 > 0) & (points[..., 2] > (FIELD_MARGIN - self._border()) * d1)
         d1 = np.where(good, d1, 1.0)
         z1 = np.where(good, xi * d1 + points[..., 2], 1.0)
         d2 = np.sqrt(np.where(good, points[..., 0] ** 2 + points[..., 1] ** 2, 0.0) + z1 * z1)

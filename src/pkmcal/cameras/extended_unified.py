@@ -14,11 +14,8 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.cameras.contract import Camera, CameraSchema
+from pkmcal.cameras.contract import FIELD_MARGIN, Camera, CameraSchema, LensSearch
 from pkmcal.cameras.quotient import field_cosine, quotient_jacobians, quotient_pixels
-
-_LEAST = 1e-9
-"""Margin, as a difference of cosines, between valid rays and the border of the field."""
 
 
 class ExtendedUnifiedSchema(CameraSchema):
@@ -45,6 +42,11 @@ class ExtendedUnified(Camera):
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "alpha", "beta",
     )  # fmt: skip
+    search: ClassVar[LensSearch] = LensSearch(
+        focal_range=(0.12, 2.0),
+        terms=((),),
+        own=((0.2, 1.0), (0.5, 1.0), (0.6, 1.0), (0.6, 1.5), (0.7, 1.0)),
+    )
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN outside the field of view."""
@@ -71,7 +73,7 @@ class ExtendedUnified(Camera):
             root = np.sqrt(1 - (2 * alpha - 1) * r2)
             z = (1 - alpha**2 * r2) / (alpha * root + 1 - alpha)
         rays = np.concatenate([m, z[..., None]], axis=-1)
-        inside = z > (_LEAST - field_cosine(alpha)) * np.sqrt(r2 + z * z)
+        inside = z > (FIELD_MARGIN - field_cosine(alpha)) * np.sqrt(r2 + z * z)
         rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return np.where(inside[..., None], rays, np.nan)
 
@@ -83,6 +85,6 @@ class ExtendedUnified(Camera):
         alpha, beta = self.parameters[4:].tolist()
         s, z = points[..., 0] ** 2 + points[..., 1] ** 2, points[..., 2]
         d = np.sqrt(beta * s + z * z)
-        good = (d > 0) & (z > (_LEAST - field_cosine(alpha)) * d)
+        good = (d > 0) & (z > (FIELD_MARGIN - field_cosine(alpha)) * d)
         d = np.where(good, d, 1.0)
         return s, d, np.where(good, alpha * d + (1 - alpha) * z, 1.0), good

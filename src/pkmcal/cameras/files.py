@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from pkmcal.cameras.colmap import is_colmap, read_colmap
 from pkmcal.cameras.contract import LEAST_FOCAL, Camera, camera_models
 from pkmcal.cameras.foreign import Intrinsics, named_entry
 from pkmcal.cameras.mrcal import is_mrcal, read_mrcal
+from pkmcal.cameras.pinhole import PINHOLE_TERMS
 from pkmcal.cameras.visp import is_visp, read_visp
 from pkmcal.errors import InputError
 from pkmcal.files import (
@@ -60,21 +61,41 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
         return _from_intrinsics(read_mrcal(text, label))
     if is_colmap(text):
         return _from_intrinsics(read_colmap(text, label, camera))
-    if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
+    if _is_opencv(text):
         return _from_opencv(text, label)
     document = parse_yaml(text, path, label)
-    cameras = [
-        key
-        for key, entry in document.data.items()
-        if isinstance(entry, dict) and "camera_model" in entry  # Kalibr's format
-    ]
-    if cameras:
+    if cameras := _kalibr_names(document.data):
         return _from_kalibr(document, cameras, camera)
     if camera is not None:
         raise _without_names(label, camera)
     if "camera_matrix" in document.data:
         return _from_ros(document)
     return camera_from_document(document)
+
+
+def is_camera_file(path: Path | str) -> bool:
+    """Whether a path, with or without a # and a name, leads to a camera's file."""
+    path, _ = camera_path(path)
+    if not path.is_file():
+        return False
+    text = read_text(path, path.name, LARGEST_WRITTEN_FILE)
+    if any(one(text) for one in (is_visp, is_mrcal, is_colmap)) or _is_opencv(text):
+        return True
+    if path.suffix not in (".yaml", ".yml"):
+        return False
+    data = parse_yaml(text, path, path.name).data
+    own = data.get("model") in camera_models()
+    return own or "camera_matrix" in data or bool(_kalibr_names(data))
+
+
+def _is_opencv(text: str) -> bool:
+    """Whether a text is a file of OpenCV's FileStorage."""
+    return "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv"))
+
+
+def _kalibr_names(data: Mapping[str, Any]) -> list[str]:
+    """Names of the cameras in Kalibr's format."""
+    return [key for key, one in data.items() if isinstance(one, dict) and "camera_model" in one]
 
 
 def _without_names(label: str, camera: str) -> InputError:
@@ -174,8 +195,6 @@ _ROS = {
 _ROS_ZERO = ("", "none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 """Distortion models that drivers write for images without distortion; supported where all
 coefficients are zero."""
-_PINHOLE_TERMS = 5
-"""Coefficients of OpenCV's model up to which it is the pinhole model."""
 _KALIBR = {
     ("pinhole", "radtan"): "pinhole",
     ("pinhole", "none"): "pinhole",
@@ -348,7 +367,7 @@ def _from_ros(document: Document) -> Camera:
 
 def _opencv_model(k: Array) -> str:
     """The simpler of pinhole and rational that has all non-zero coefficients of OpenCV's model."""
-    return "rational" if np.any(k[_PINHOLE_TERMS:]) else "pinhole"
+    return "rational" if np.any(k[PINHOLE_TERMS:]) else "pinhole"
 
 
 def _from_intrinsics(given: Intrinsics) -> Camera:

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.cameras.contract import Camera, CameraSchema
+from pkmcal.cameras.contract import Camera, CameraSchema, LensSearch
 
 _POWERS = np.array([3, 5, 7, 9])
 """Powers of the angle in the terms of k1 to k4."""
@@ -46,6 +46,10 @@ class Fisheye(Camera):
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "k1", "k2", "k3", "k4",
     )  # fmt: skip
+    search: ClassVar[LensSearch] = LensSearch(
+        focal_range=(0.12, 2.0),
+        terms=((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3"), ("k1", "k2", "k3", "k4")),
+    )
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN outside the field of view."""

@@ -20,9 +20,9 @@ Entry = TypeVar("Entry")
 class Intrinsics:
     """Numbers of another program's camera.
 
-    model : pkmcal's camera model. image_size : (width, height), px. focal, center : px, pixel
-    centres at integers. distortion : coefficients in the model's order. where : file and place
-    for messages.
+    model : pkmcal's camera model; rational also for a pinhole camera. image_size : (width, height),
+    px. focal, center : px, pixel centres at integers. distortion : coefficients in the model's
+    order. where : file and place for messages.
     """
 
     model: str

@@ -20,7 +20,6 @@ _LENS_COEFFICIENTS = {
 }  # fmt: skip
 """Number of distortion coefficients by mrcal's lens model."""
 _PREFIX = "LENSMODEL_"
-_MOST_PINHOLE_TERMS = 5
 
 
 def is_mrcal(text: str) -> bool:
@@ -59,13 +58,12 @@ def read_mrcal(text: str, label: str) -> Intrinsics:
     count = 4 + _LENS_COEFFICIENTS[lens]
     numbers = _numbers(fields.get("intrinsics"), count, f"{label}, intrinsics")
     width, height = _numbers(fields.get("imagersize"), 2, f"{label}, imagersize")
-    k = tuple(numbers[4:])
     return Intrinsics(
-        model="rational" if any(k[_MOST_PINHOLE_TERMS:]) else "pinhole",
+        model="rational",
         image_size=(round(width), round(height)),
         focal=(numbers[0], numbers[1]),
         center=(numbers[2], numbers[3]),
-        distortion=k if any(k[_MOST_PINHOLE_TERMS:]) else k[:_MOST_PINHOLE_TERMS],
+        distortion=tuple(numbers[4:]),
         where=label,
     )
 

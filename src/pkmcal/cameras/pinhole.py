@@ -11,9 +11,11 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.cameras.contract import Camera, CameraSchema
+from pkmcal.cameras.contract import FIELD_MARGIN, Camera, CameraSchema, LensSearch
 from pkmcal.geometry.rigid import dot, of_components
 
+PINHOLE_TERMS = 5
+"""Coefficients k1 k2 p1 p2 k3, the first of OpenCV's model."""
 _NEWTON_STEPS = 20
 """Most Newton steps for an undistorted point."""
 _TABLE = 513
@@ -189,7 +191,7 @@ class PinholeSchema(CameraSchema):
     """
 
     model: Literal["pinhole"]
-    distortion: Annotated[tuple[float, ...], Field(max_length=5)] = ()
+    distortion: Annotated[tuple[float, ...], Field(max_length=PINHOLE_TERMS)] = ()
 
 
 @final
@@ -203,6 +205,12 @@ class Pinhole(Camera):
         "focal.x", "focal.y", "center.x", "center.y", "k1", "k2", "p1", "p2", "k3",
     )  # fmt: skip
     odd: ClassVar[tuple[str, ...]] = ("p1", "p2")
+    search: ClassVar[LensSearch] = LensSearch(
+        focal_range=(0.3, 6.0),
+        terms=(
+            (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
+        ),
+    )  # fmt: skip
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold of the
@@ -264,7 +272,7 @@ class Pinhole(Camera):
         (..., 2, 2), None without distortion.
         """
         z = points[..., 2]
-        front = z > 1e-9
+        front = z > FIELD_MARGIN
         z = np.where(front, z, 1.0)
         xy = of_components(points[..., 0] / z, points[..., 1] / z)
         lens = self.parameters[4:]

@@ -15,12 +15,15 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.cameras.contract import Camera, CameraSchema
-from pkmcal.cameras.pinhole import before_fold, distort_by_coefficients, in_pixels, inverse_distort
+from pkmcal.cameras.contract import FIELD_MARGIN, Camera, CameraSchema, LensSearch
+from pkmcal.cameras.pinhole import (
+    PINHOLE_TERMS,
+    before_fold,
+    distort_by_coefficients,
+    in_pixels,
+    inverse_distort,
+)
 from pkmcal.geometry.rigid import of_components
-
-_PINHOLE_TERMS = 5
-"""Coefficients k1 k2 p1 p2 k3, which stand first, as in the pinhole model."""
 
 
 class RationalSchema(CameraSchema):
@@ -44,6 +47,14 @@ class Rational(Camera):
         "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau.x", "tau.y",
     )  # fmt: skip
     odd: ClassVar[tuple[str, ...]] = ("p1", "p2", "s1", "s2", "s3", "s4", "tau.x", "tau.y")
+    search: ClassVar[LensSearch] = LensSearch(
+        focal_range=(0.3, 6.0),
+        terms=(
+            ("k1", "k4"), ("k1", "k2", "p1", "p2", "k4"), ("k1", "k2", "p1", "p2", "k4", "k5"),
+            ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+            ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+        ),
+    )  # fmt: skip
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold of the
@@ -105,7 +116,7 @@ class Rational(Camera):
         :func:`_distort` (..., 2, 2).
         """
         z = points[..., 2]
-        front = z > 1e-9
+        front = z > FIELD_MARGIN
         z = np.where(front, z, 1.0)
         xy = of_components(points[..., 0] / z, points[..., 1] / z)
         k = self.parameters[4:16]
@@ -164,7 +175,7 @@ def _distort_by_coefficients(xy: Array, k: Array) -> Array:
     s = np.sum(xy * xy, axis=-1)
     top, bottom, _, _ = _ratio(s, k)
     by_k = np.zeros((*xy.shape, 12))
-    by_k[..., :_PINHOLE_TERMS] = distort_by_coefficients(xy)
+    by_k[..., :PINHOLE_TERMS] = distort_by_coefficients(xy)
     by_k[..., [0, 1, 4]] /= bottom[..., None, None]
     by_k[..., 5:8] = -by_k[..., [0, 1, 4]] * (top / bottom)[..., None, None]
     by_k[..., 0, 8] = by_k[..., 1, 10] = s

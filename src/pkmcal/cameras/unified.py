@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.cameras.contract import Camera, CameraSchema
+from pkmcal.cameras.contract import FIELD_MARGIN, Camera, CameraSchema, LensSearch
 from pkmcal.cameras.pinhole import (
     before_image_fold,
     distort,
@@ -25,10 +25,6 @@ from pkmcal.cameras.pinhole import (
     undistort,
 )
 from pkmcal.geometry.rigid import dot, of_components
-
-_LEAST = 1e-9
-"""Margin, as a difference of cosines, between valid rays and the border of the field, where image
-points go to infinity."""
 
 
 class UnifiedSchema(CameraSchema):
@@ -53,6 +49,11 @@ class Unified(Camera):
         "focal.x", "focal.y", "center.x", "center.y", "xi", "k1", "k2", "p1", "p2",
     )  # fmt: skip
     odd: ClassVar[tuple[str, ...]] = ("p1", "p2")
+    search: ClassVar[LensSearch] = LensSearch(
+        focal_range=(0.12, 2.0),
+        terms=((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
+        own=((0.0,), (0.5,), (1.0,), (1.5,), (2.2,)),
+    )
 
     @property
     def xi(self) -> float:
@@ -133,7 +134,7 @@ class Unified(Camera):
         depth = points[..., 2] + self.xi * distance
         # Beyond cos = -1 / xi (or -xi) rays share pixels with rays inside the field.
         edge = -min(self.xi, 1 / self.xi) if self.xi > 0 else 0.0
-        inside = there & (points[..., 2] > (edge + _LEAST) * distance)
+        inside = there & (points[..., 2] > (edge + FIELD_MARGIN) * distance)
         depth = np.where(inside, depth, 1.0)
         xy = of_components(points[..., 0] / depth, points[..., 1] / depth)
         if not self.parameters[5:].any():

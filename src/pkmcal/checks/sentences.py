@@ -199,7 +199,7 @@ def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         command="check",
         title=f"Check of {name}",
         subject=f"{name}: {check.machine}, {check.n_legs} legs,"
-        f" {check.configurations} configurations, {images} images"
+        f" {check.configurations} configurations" + (f", {images} images" if check.stations else "")
         if check.machine
         else "",
         verdict=Verdict(code == 0, headlines[2 if refused else code], check.advice),

@@ -7,7 +7,17 @@ from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
-from pkmcal.commands.options import argument, as_json, choice, choices, command, option, out
+from pkmcal.commands.options import (
+    argument,
+    as_json,
+    choice,
+    choices,
+    command,
+    flag,
+    number,
+    option,
+    out,
+)
 from pkmcal.ranges import CameraFileFormat, CameraModelChoice
 
 EXAMPLES = """\
@@ -28,6 +38,11 @@ pkmcal camera mirror --model unified --to opencv
         Path,
     ),
     choice("model", CameraModelChoice, "Camera model; unified is for mirrors."),
+    number(
+        "camera", "distance", "M", "Distance of the map of the projection's uncertainty.",
+        usual="the boards'",
+    ),
+    flag("--bend", "Estimate the board's bend: two parabolas, along its columns and rows."),
     choices("to", CameraFileFormat, "Camera file of another program to write as well; repeatable."),
     out("camera"),
     as_json(),

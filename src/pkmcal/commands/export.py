@@ -24,8 +24,8 @@ pkmcal export h4 --to ros --json
         " name of a built-in machine.",
     ),
     option(
-        "--to", "FORMAT", "c, json, klipper, linuxcnc, marlin, mujoco, repetier, reprap, ros, sdf,"
-        " smoothie, urdf or yaml.",
+        "--to", "FORMAT", "c, hangprinter, json, klipper, linuxcnc, marlin, mujoco, repetier,"
+        " reprap, ros, sdf, smoothie, urdf or yaml.",
         required=True,
     ),
     cameras_session(),

@@ -50,7 +50,8 @@ def _dimension(name: str, described: str, usual: str = "") -> Any:
     ),
     option(
         "--from from_file", "FILE", "MJCF, SDF, or URDF with its file of loops; Klipper's"
-        " printer.cfg of a rotary delta or a winch; or, with --leg, a hexapod's joint centres:"
+        " printer.cfg of a rotary delta or a winch, RepRapFirmware's configuration of a"
+        " Hangprinter, or a Maslow 4's calibration log; with --leg, a hexapod's joint centres:"
         " LinuxCNC's HAL file of genhexkins, or a CSV table.",
         Path,
     ),

@@ -33,7 +33,6 @@ from pkmcal.mechanisms.closure import (
     closure,
     limb_ends,
     rod_lengths,
-    rod_rates,
 )
 from pkmcal.mechanisms.kinematics import closure_at, forward
 
@@ -85,8 +84,15 @@ def machine_view(
     """View of a machine whose given legs are seen by a camera; by default all legs with tubes.
 
     Each leg is seen by its tube with the longest visible length at home. Raises InputError for a
-    leg that does not exist, is repeated or has no tube.
+    leg that does not exist, is repeated or has no tube, and for cables over pulleys.
     """
+    if machine.layout.windings:
+        raise InputError(
+            what=f"control by the legs of {machine.name!r} takes rods, of which the whole length is"
+            " seen",
+            found="cables on pulleys or spools",
+            expected="joints other than pulley and spool",
+        )
     tubed = [j for j, leg in enumerate(machine.document.legs) if leg.tubes]
     wanted = np.array(tubed if legs is None else legs, dtype=int)
     missing = sorted({int(j) + 1 for j in wanted} - {j + 1 for j in tubed})
@@ -147,7 +153,7 @@ def legs_at(view: MachineView, T_base_platform: Array, readings: Array | None = 
     c = closure_at(layout, theta, T_base_platform)
     if readings is not None:
         c = closure(layout, theta, readings, T_base_platform, c.internal)
-    return _of_closure(view, c, c.rows.u, T_base_platform[..., :3, 3])
+    return _of_closure(c, c.rows.u, T_base_platform[..., :3, 3])
 
 
 def legs_from_image(
@@ -170,7 +176,7 @@ def legs_from_image(
     c = closure(layout, theta, readings, poses, internal)
     directions = np.array(np.broadcast_to(c.rows.u, (*fk.converged.shape, *c.rows.u.shape[-2:])))
     directions[..., view.legs, :] = u
-    legs = _of_closure(view, c, directions, poses[..., :3, 3])
+    legs = _of_closure(c, directions, poses[..., :3, 3])
     return moved_to(legs, legs.b.mean(axis=-2))
 
 
@@ -218,7 +224,7 @@ def _by_image(view: MachineView, u: Array, readings: Array) -> Legs:
     b = a + length[..., None] * u
     pivot = b.mean(axis=-2)
     b_by_pose = by_pose(b - pivot[..., None, :])
-    by_reading = -dot(u, base.by_reading) - rod_rates(layout, theta)
+    by_reading = -dot(u, base.by_reading) - base.rate
     return Legs(
         a, b, u, length, pivot, np.broadcast_to(base.by_reading, u.shape), b_by_pose,
         np.zeros((*b.shape, 0)), along(u, b_by_pose), np.zeros((*length.shape, 0)),
@@ -226,7 +232,7 @@ def _by_image(view: MachineView, u: Array, readings: Array) -> Legs:
     )  # fmt: skip
 
 
-def _of_closure(view: MachineView, c: Closure, u: Array, pivot: Array) -> Legs:
+def _of_closure(c: Closure, u: Array, pivot: Array) -> Legs:
     """Limbs of a closed machine, with given directions (..., L, 3).
 
     The rows of the rods' lengths use these directions; the rows of joint axes are unchanged.
@@ -242,7 +248,7 @@ def _of_closure(view: MachineView, c: Closure, u: Array, pivot: Array) -> Legs:
         rows[..., :n, :] = along(own, c.b_by_pose[..., keep, :, :])
         hinges[..., :n, :] = along(own, b_by_internal[..., keep, :, :])
         shifted = dot(own, a_by_reading[..., keep, :])
-        by_reading[..., :n] = -shifted - rod_rates(layout, view.theta)[..., keep]
+        by_reading[..., :n] = -shifted - np.broadcast_to(c.base.rate, u.shape[:-1])[..., keep]
     return Legs(
         a=np.broadcast_to(c.a, u.shape),
         b=np.broadcast_to(c.b, u.shape),

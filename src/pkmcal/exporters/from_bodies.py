@@ -51,9 +51,9 @@ MOTIONS = {
 """Motion by the slides and the number of hinges between base and platform."""
 
 
-def is_model(path: Path) -> bool:
-    """Whether a file is XML."""
-    return path.is_file() and read_text(path).lstrip().startswith("<")
+def is_model(text: str) -> bool:
+    """Whether a text is XML."""
+    return text.lstrip().startswith("<")
 
 
 def bodies_model(path: Path, given: Mapping[str, float]) -> NominalModel:

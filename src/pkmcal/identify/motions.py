@@ -184,7 +184,8 @@ class NamedChanges:
 
 def candidates(s: Situation) -> Iterator[NamedChanges]:
     """All motions, the most specific first; the last one is any change at all."""
-    yield from (_unseen(s, j) for j in s.legs if not s.observed[:, j].any())
+    if s.imaged:
+        yield from (_unseen(s, j) for j in s.legs if not s.observed[:, j].any())
     yield from _conventions(s)
     carried = [m for j in s.legs for m in _carriers(s, j)]
     own = [motion for j in s.legs for motion in _of_one_leg(s, j)]

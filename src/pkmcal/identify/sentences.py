@@ -205,14 +205,25 @@ def advice_on(
         "caliper": f"{caliper} and give a small tolerance.radius",
         "more or caliper": f"{more}; or measure the tubes with a caliper",
         "turn": f"{take} configurations that turn these joints further, to both sides",
-        "size": "Observe a board with the legs (observe: [legs, board]), whose squares determine"
-        " the size, or check the readings over a long way against a measure",
+        "size": _sizing(around),
         "drawing": "Legs look the same however these axes lie: leave them to the nominal model",
     }[open_motion.motion.advice]
     decide = f"{held} if the nominal model is sure of that"
     if weak:
         decide = "state smaller tolerances in the mechanism file if the nominal model warrants them"
     return f"{do}; or {decide}."
+
+
+def _sizing(around: Situation) -> str:
+    """Advice on measurements that determine the size of everything."""
+    if not around.imaged:
+        return (
+            "Measure distances between positions of the tool (distances), which determine the size"
+        )
+    return (
+        "Observe a board with the legs (observe: [legs, board]), whose squares determine the size,"
+        " or check the readings over a long way against a measure"
+    )
 
 
 def _tying(around: Situation, legs: tuple[int, ...]) -> str:

@@ -209,7 +209,7 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
     measurements do not help.
     """
     layout = machine.layout
-    moved = np.flatnonzero((layout.actuated >= 0) & ~layout.rod_reads)
+    moved = np.flatnonzero((layout.actuated >= 0) & ~layout.lengthens)
     if len(measurements.edges) and not measurements.on_platform.any() and moved.size:
         return InputError(
             f"the readings of {machine.name} cannot be predicted from images of its legs yet",

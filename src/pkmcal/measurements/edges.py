@@ -466,13 +466,15 @@ class EdgeRows:
         across, swung = turned[..., :3], turned[..., 3:]
         by_internal = c.platform.by_internal
         parts = (c.b_by_pose[..., freedoms], by_internal, c.b_by, c.a_by)
-        ends = across @ _side_by_side(parts, c.rows.distance.shape).take(
-            views.limbs(c.layout.n_legs), axis=1
-        )
+        every, limbs = _side_by_side(parts, c.rows.distance.shape), views.limbs(c.layout.n_legs)
+        ends = across @ every.take(limbs, axis=1)
         of_b = ends.shape[-1] - c.a_by.shape[-1]
         out = np.zeros((*ends.shape[:2], 4, ends.shape[-1] + 6))
         out[..., 2:, :of_b] = ends[..., :of_b]
         out[..., :2, of_b:-6] = ends[..., of_b:]
+        if c.layout.windings:  # a moves on its pulley with b
+            by_b = c.a_by_b.reshape(len(every), -1, 3, 3)
+            out[..., :2, :of_b] = across @ (by_b @ every[..., :of_b]).take(limbs, axis=1)
         nearest = line.distance[..., None] * line.u
         for k, place in ((0, line.before), (2, line.behind)):
             # with p = distance w + place u: omega x (p - t) along m is omega . (p x m + m x t)

@@ -38,12 +38,14 @@ class BaseEnds(NamedTuple):
     """Base side of the limbs at given readings; leading axes broadcast.
 
     a, by_reading : (..., L, 3) ends A, m, base frame, and their derivatives by each leg's reading.
-    length : (..., L) of the rods, m; NaN for passive ones.
+    length, rate : (..., L) of the rods, m, and derivatives by each leg's reading; lengths are NaN
+        for passive ones.
     """
 
     a: Array
     by_reading: Array
     length: Array
+    rate: Array
 
 
 class PlatformEnds(NamedTuple):
@@ -82,7 +84,32 @@ def base_ends(layout: LimbLayout, theta: Array, readings: Array) -> BaseEnds:
     q = joint_values(layout, theta, readings)
     placed = [g.carrier.place(g.of(theta), q[..., g.legs]) for g in layout.base]
     a, by_value = (_leg_points(layout.base, side) for side in zip(*placed, strict=True))
-    return BaseEnds(a, by_value * scales(layout, theta)[..., None], _rod_lengths(layout, theta, q))
+    scale = scales(layout, theta)
+    length, rate = _rod_lengths(layout, theta, q), rod_rates(layout, theta)
+    if layout.windings:
+        length, rate = (np.array(x) for x in np.broadcast_arrays(length, rate))
+        for g in layout.windings:
+            paid, by_paid, _ = g.carrier.paid_out(g.of(theta), q[..., g.legs])
+            length[..., g.legs] += paid
+            rate[..., g.legs] += by_paid * scale[..., g.legs]
+    return BaseEnds(a, by_value * scale[..., None], length, rate)
+
+
+def at_tangents(
+    layout: LimbLayout, theta: Array, base: BaseEnds, platform: PlatformEnds
+) -> BaseEnds:
+    """Base side with the ends A of cables where their free parts begin, and the lengths of these
+    parts.
+    """
+    if not layout.windings:
+        return base
+    shape = np.broadcast_shapes(base.a.shape, platform.b.shape)
+    a, length = np.array(np.broadcast_to(base.a, shape)), base.length
+    length = np.array(np.broadcast_to(length, np.broadcast_shapes(length.shape, shape[:-1])))
+    for g in layout.windings:
+        a[..., g.legs, :], wound = g.carrier.tangent_point(g.of(theta), platform.b[..., g.legs, :])
+        length[..., g.legs] -= wound
+    return base._replace(a=a, length=length)
 
 
 def platform_ends(
@@ -314,7 +341,18 @@ class LimbEnds:
     def _at_readings(self, values: Array) -> Array:
         """Values of the base side (..., L, 3), broadcast to the batch's shape."""
         shape = np.broadcast_shapes(self.theta.shape[:-1], self.readings.shape[:-1])
-        return np.broadcast_to(values, (*shape, self.layout.n_legs, 3))
+        shape = np.broadcast_shapes(values.shape, (*shape, self.layout.n_legs, 3))
+        return np.broadcast_to(values, shape)
+
+    @cached_property
+    def a_by_b(self) -> Array:
+        """Derivatives (..., L, 3, 3) of a by b; zero but for cables over pulleys."""
+        layout = self.layout
+        out = np.zeros((*self.b.shape, 3))
+        for g in layout.windings:
+            by = g.carrier.tangent_by_b(g.of(self.theta), self.b[..., g.legs, :])
+            out[..., g.legs, :, :] = by
+        return out
 
     @cached_property
     def b_by_pose(self) -> Array:
@@ -326,12 +364,24 @@ class LimbEnds:
         """Derivatives (..., L, 3, n) of a by the parameters at the layout's ``a_index``."""
         layout, theta = self.layout, self.theta
         q = joint_values(layout, theta, self.readings)
-        by = [g.carrier.by_parameters(g.of(theta), q[..., g.legs]) for g in layout.base]
+        by = [
+            self._winding_by(g)[0]
+            if g.winds
+            else g.carrier.by_parameters(g.of(theta), q[..., g.legs])
+            for g in layout.base
+        ]
         padded = _leg_derivatives(layout.n_legs, layout.base, by)
         if not layout.scales_move_a:
             return padded
         raw = _leg_readings(layout, self.readings) / scales(layout, theta)
         return _side_by_side((padded, (self.a_by_reading * raw[..., None])[..., None]))
+
+    def _winding_by(self, group: CarrierGroup) -> tuple[Array, Array]:
+        """Derivatives (..., g, 3, n) of the ends A of cables, and (..., g, n) of the lengths up to
+        them, by the carriers' parameters.
+        """
+        at = self.b[..., group.legs, :]
+        return group.carrier.tangent_by_parameters(group.of(self.theta), at)
 
     @cached_property
     def b_by(self) -> Array:
@@ -356,7 +406,7 @@ class Closure(LimbEnds):
     def by_reading(self) -> Array:
         """Derivatives (..., E) by the reading of each row's leg, zero without one."""
         layout, by_own_reading = self.layout, self.base.by_reading
-        by = -dot(self.rows.u, by_own_reading) - rod_rates(layout, self.theta)
+        by = -dot(self.rows.u, by_own_reading) - self.base.rate
         by = by if layout.all_close else by[..., layout.closing]
         if not len(layout.angles):
             return by
@@ -386,12 +436,31 @@ class Closure(LimbEnds):
     def _by_length(self) -> Array:
         """Derivatives of |B - A| - length, for the legs that close."""
         layout, u = self.layout, self.rows.u
-        parts = (-along(u, self.a_by), along(u, self.b_by), np.full((1, 1), -1.0))
+        by_a = -along(u, self.a_by)
+        if layout.windings:
+            by_a = self._with_cables(by_a)
+        parts = (by_a, along(u, self.b_by), np.full((1, 1), -1.0))
         if layout.scales_move_rods:
             grown = np.where(layout.rod_reads, _leg_readings(layout, self.readings), 0.0)
             parts = (*parts, -grown[..., None])
         by_theta = _side_by_side(parts)
         return by_theta if layout.all_close else by_theta[..., layout.closing, :]
+
+    def _with_cables(self, by_a: Array) -> Array:
+        """Derivatives (..., L, n) by the parameters at ``a_index`` with those of the lengths on
+        pulleys and of the lengths paid out.
+        """
+        layout, out = self.layout, np.array(by_a)
+        q = joint_values(layout, self.theta, self.readings)
+        for g in layout.windings:
+            paid = g.carrier.paid_out(g.of(self.theta), q[..., g.legs])[2]
+            n = paid.shape[-1]
+            out[..., g.legs, :n] += self._winding_by(g)[1] - paid
+        if layout.scales_move_a:
+            raw = _leg_readings(layout, self.readings) / scales(layout, self.theta)
+            driven = layout.lengthens & ~layout.rod_reads
+            out[..., -1] -= np.where(driven, self.base.rate * raw, 0.0)
+        return out
 
     def _by_angles(self) -> Array:
         """Derivatives of the axes' equations."""
@@ -417,8 +486,8 @@ def limb_ends(
     poses : T_base_platform (..., 4, 4).
     internal : (..., n) internal coordinates of the poses, zero by default.
     """
-    base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
+    base = at_tangents(layout, theta, base_ends(layout, theta, readings), platform)
     return LimbEnds(layout, theta, readings, poses, internal, base, platform)
 
 
@@ -447,8 +516,8 @@ def closure(
     poses : T_base_platform (..., 4, 4).
     internal : (..., n) internal coordinates of the poses, zero by default.
     """
-    base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
+    base = at_tangents(layout, theta, base_ends(layout, theta, readings), platform)
     rows = rows_between(layout, theta, base, platform, poses)
     return Closure(layout, theta, readings, poses, internal, base, platform, rows)
 

@@ -69,7 +69,7 @@ def drives_of(machine: Machine) -> Drives:
     chains = skeletons(layout, machine.values, zero)
     driven = np.zeros(machine.n_legs, dtype=bool)
     for g in layout.base:
-        driven[g.legs] = g.carrier.driven
+        driven[g.legs] = g.carrier.driven and not g.winds
     several = np.array([len(chain) > 1 for chain in chains])
     arms, guides = driven & several, driven & ~several
     # arms: radius, and axis from the velocities at two joint values a quarter turn apart

@@ -9,7 +9,7 @@ from the batch.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -29,6 +29,7 @@ from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms.closure import (
     BaseEnds,
     Closure,
+    at_tangents,
     base_ends,
     by_own,
     closure,
@@ -156,7 +157,8 @@ def close(
 def base_batch_last(base: BaseEnds) -> BaseEnds:
     """Base side with the arrays that differ between rows in batch-last memory order."""
     a, by_reading = (batch_last(x) if x.ndim > 2 else x for x in (base.a, base.by_reading))
-    return BaseEnds(a, by_reading, batch_last(base.length) if base.length.ndim > 1 else base.length)
+    length, rate = (batch_last(x) if x.ndim > 1 else x for x in (base.length, base.rate))
+    return BaseEnds(a, by_reading, length, rate)
 
 
 def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
@@ -203,7 +205,8 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
 def _state_at(task: _Task, poses: Array, internal: Array) -> _State:
     """State of the rows at poses (n, 4, 4) and internal coordinates."""
     platform = platform_ends(task.layout, task.theta, poses, internal, task.platform)
-    rows = rows_between(task.layout, task.theta, task.base, platform, poses)
+    base = at_tangents(task.layout, task.theta, task.base, platform)
+    rows = rows_between(task.layout, task.theta, base, platform, poses)
     cost = (rows.value * rows.value).sum(axis=-1)
     worst = np.maximum.reduce(np.abs(rows.value), axis=-1, initial=0.0)
     return _State(poses, internal, rows.value, by_own(task.layout, rows), cost, worst)
@@ -225,12 +228,12 @@ def _task_rows(task: _Task, rows: Integers) -> _Task:
     """Task restricted to some of its rows."""
     base = task.base
     a, by_reading = (picked(x, rows) if x.ndim > 2 else x for x in (base.a, base.by_reading))
-    length = picked(base.length, rows) if base.length.ndim > 1 else base.length
+    length, rate = (picked(x, rows) if x.ndim > 1 else x for x in (base.length, base.rate))
     theta = task.theta[rows] if task.theta.ndim > 1 else task.theta
     return task._replace(
         theta=theta,
         platform=platform_parameters(task.layout, theta),
-        base=BaseEnds(a, by_reading, length),
+        base=BaseEnds(a, by_reading, length, rate),
         number=task.number[rows],
     )
 
@@ -331,8 +334,9 @@ def _leg_readings(
     """Reading of each leg (..., L), zero without one; the solution nearest to ``readings``
     (..., m), or to mid-range.
     """
-    at_zero = base_ends(layout, theta, np.zeros(layout.n_readings))
     platform = platform_ends(layout, theta, poses, internal)
+    at_zero = base_ends(layout, theta, np.zeros(layout.n_readings))
+    at_zero = at_tangents(layout, theta, at_zero, platform)
     distance = limb_lines(at_zero, platform)[1]
     # A rod on a fixed centre is linear in its reading.
     out, scale = np.where(layout.rod_reads, distance - at_zero.length, 0.0), scales(layout, theta)
@@ -407,6 +411,26 @@ def forward(
         rods = np.nanmedian(np.abs(rod_lengths(layout, theta, readings)), axis=-1)
         converged = error < KINEMATICS.other_machine_gap * rods
     return ForwardResult(poses, converged, error, inner, layout, theta, readings)
+
+
+def driven_towards(
+    layout: LimbLayout,
+    theta: Array,
+    readings: Array,
+    start: Array,
+    internal: Array | None = None,
+) -> ForwardResult:
+    """Poses that a built machine takes when it is driven towards readings (..., m), with the
+    readings of its motors there; arguments as for :func:`forward`.
+
+    An overdetermined machine closes only at readings that agree with each other, so those of
+    another machine, such as its nominal model, are replaced by its own at the least-squares pose.
+    """
+    fk = forward(layout, theta, readings, start, internal)
+    if not layout.overdetermined:
+        return fk
+    exact = on_manifold(layout, theta, fk.T_base_platform)
+    return replace(exact, converged=exact.converged & fk.converged)
 
 
 def _least_squares_poses(

@@ -9,7 +9,12 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.mechanisms.carriers.contract import base_carriers, of_part, platform_carriers
+from pkmcal.mechanisms.carriers.contract import (
+    Winding,
+    base_carriers,
+    of_part,
+    platform_carriers,
+)
 from pkmcal.mechanisms.document import (
     MOTION_DIRECTIONS,
     ActuatedLength,
@@ -35,6 +40,11 @@ class CarrierGroup:
     index: Integers
     constants: Array
     silent: Booleans
+
+    @property
+    def winds(self) -> bool:
+        """Whether the legs are cables over pulleys."""
+        return issubclass(self.carrier, Winding)
 
     @cached_property
     def complete(self) -> bool:
@@ -92,6 +102,19 @@ class LimbLayout:
     n_parameters: int
 
     __repr__ = short_repr
+
+    @cached_property
+    def windings(self) -> tuple[CarrierGroup, ...]:
+        """Groups of legs that are cables over pulleys."""
+        return tuple(g for g in self.base if g.winds)
+
+    @cached_property
+    def lengthens(self) -> Booleans:
+        """Whether each leg's reading (L,) makes the leg longer, rather than moving its end A."""
+        out = self.rod_reads.copy()
+        for group in self.windings:
+            out[group.legs] |= group.carrier.driven
+        return out
 
     @cached_property
     def n_equations(self) -> int:

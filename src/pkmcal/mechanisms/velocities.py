@@ -51,7 +51,7 @@ def inverse_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     rows = layout.driven_rows[np.argsort(layout.row_motor[layout.driven_rows])]
     legs = np.flatnonzero(layout.closing)[rows]
     gain = c.by_reading[..., rows]
-    usable = np.abs(gain) > LEAST_GAIN_FOR_RATES * _reading_scale(layout, c.base)[..., legs]
+    usable = np.abs(gain) > LEAST_GAIN_FOR_RATES * _reading_scale(c.base)[..., legs]
     return -c.rows.by_pose[..., rows, :] / np.where(usable, gain, np.nan)[..., None]
 
 
@@ -82,7 +82,7 @@ def _shared_motor_jacobian(c: Closure) -> Array:
     # Scale readings and hinges to unit displacements, so that the rank is without units.
     legs = np.flatnonzero(layout.closing)
     by_motor = layout.actuated[legs][:, None] == np.arange(m)
-    largest = np.where(by_motor, _reading_scale(layout, c.base)[..., legs, None], 0.0).max(axis=-2)
+    largest = np.where(by_motor, _reading_scale(c.base)[..., legs, None], 0.0).max(axis=-2)
     hinges = own_scale(layout, c.theta)[..., layout.motion.shape[1] :]
     shape = np.broadcast_shapes(largest.shape[:-1], hinges.shape[:-1])
     parts = (1 / largest, hinges)
@@ -94,9 +94,9 @@ def _shared_motor_jacobian(c: Closure) -> Array:
     return (scale[..., :, None] * rates)[..., :m, :]
 
 
-def _reading_scale(layout: LimbLayout, base: BaseEnds) -> Array:
+def _reading_scale(base: BaseEnds) -> Array:
     """Displacement of each limb's end, or change of its length, by unit reading, (..., L)."""
-    return np.sqrt(dot(base.by_reading, base.by_reading)) + layout.rod_reads
+    return np.sqrt(dot(base.by_reading, base.by_reading)) + np.abs(base.rate)
 
 
 def _pseudo_inverse(jac: Array) -> Array:

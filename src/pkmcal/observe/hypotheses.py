@@ -316,9 +316,10 @@ def _likelier(
     session, if any, with the rivals that it does not exclude.
 
     count : number of explanations of which these are the likeliest; of these, if None. Chance may
-    confirm any of them, so the p-value of each is multiplied by their number (Bonferroni). The
-    constants of a reversed motor are one explanation, as in the prior odds: those near each other
-    show nearly the same legs.
+    confirm any of them, so the p-value of each is multiplied by their number (Bonferroni). It then
+    has to be below the limit, and, if the same search confirms the session as stated, no larger
+    than its p-value. The constants of a reversed motor are one explanation, as in the prior odds:
+    those near each other show nearly the same legs.
     """
     if not hypotheses:
         return None
@@ -332,6 +333,7 @@ def _likelier(
         )
         poses = np.stack([f.T_camera_base for f in (localization, own, *searched)])
         stated = likelihood_from(view, poses)
+        limit = min(own.limit, own.p_value) if own.good else own.limit
         out = np.full(len(hypotheses), -np.inf)
         for k, (h, other, at) in enumerate(zip(hypotheses, views, searched, strict=True)):
             if not at.good or station._replace(localization=at).elsewhere:
@@ -341,7 +343,7 @@ def _likelier(
             # are in order
             if station.elsewhere and localization.good and not in_order and h.readings is not None:
                 out[k] = ratio + options.pose_by_hand
-            elif at.p_value * count < at.limit:
+            elif at.p_value * count <= limit:
                 out[k] = ratio
         return out
 

@@ -11,7 +11,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import segment_distance
-from pkmcal.geometry.rigid import dot, perturb
+from pkmcal.geometry.rigid import dot, perturb, pose_difference
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.drives import drives_of, reaches
@@ -126,9 +126,22 @@ def _candidates(
         poses = _around_home(machine, n, rng)
     joints = machine.inverse(poses)
     finite = np.isfinite(joints).all(axis=-1)
-    if machine.layout.overdetermined and ranges.size:
+    if machine.layout.overdetermined:
+        # the nearest poses may be beyond the ranges, or in an assembly mode that is not home's
         finite &= ~((joints < ranges[:, 0]) | (joints > ranges[:, 1])).any(axis=-1)
+        # the nearest pose to random lengths may be turned so far that cables would cross
+        finite &= same_mode(poses, machine.home())
+        poses, joints = poses[finite], joints[finite]
+        finite = same_mode(machine.forward_result(joints).T_base_platform, poses)
     return poses[finite], joints[finite]
+
+
+def same_mode(T_base_platform: Array, near: Array) -> Booleans:
+    """(n,) True where two poses (n, 4, 4) are turned to each other by less than another assembly
+    mode of a machine with extra rods would be.
+    """
+    turn = np.linalg.norm(pose_difference(T_base_platform, near)[..., :3], axis=-1)
+    return np.asarray(turn < FARTHEST_TILT)
 
 
 def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:

@@ -25,9 +25,9 @@ from pkmcal.outcome.blocks.base import configuration_key
 from pkmcal.outcome.blocks.images import Arrow, Image, Images, Layer, Overlay, Ring, Shape
 from pkmcal.outcome.blocks.plot import panels
 from pkmcal.outcome.blocks.text import Listing, Paragraph
-from pkmcal.report.camera_plots import field_plots, models_plot
+from pkmcal.report.camera_plots import field_plots, models_plot, uncertainty_plot
 from pkmcal.report.field import ImageField, field_image
-from pkmcal.wording import brief, count, decimals, number
+from pkmcal.wording import Chance, brief, count, decimals, number
 
 VIEW_RESIDUAL_ARROW_LENGTH = 0.05
 """Length of a large residual's arrow, in image widths."""
@@ -43,6 +43,11 @@ CAMERA_MODELS_TEXT = (
     "Every model with more and more distortion terms. What counts is the error on views left out of"
     " the fit; a term is taken only where they gain from it, and the model with the fewest"
     " parameters among equals."
+)
+PROJECTION_TEXT = (
+    "1σ, in the worst direction, of the pixel of a point that stands still relative to the boards,"
+    " if other images of this kind were taken. A rotation of the camera frame that replaces a"
+    " change of the intrinsics does not count. Where no corners were, the lens is extrapolated."
 )
 CAMERA_SIGMA_TEXT = (
     "The standard deviations are those with which the intrinsics would scatter if other"
@@ -66,6 +71,7 @@ def outcome_of(
     c = calibration
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly distinguished, and so to be used together only: {together}."
+    distances = (np.inf, c.distance)
     # with its covariance, which is the prior of `calibrate --refine-camera`
     measured = replace(c.camera, covariance=c.covariance)
     return Outcome(
@@ -77,7 +83,7 @@ def outcome_of(
             Part(
                 "intrinsics",
                 "Intrinsics",
-                tables=(_intrinsics(c),),
+                tables=(_intrinsics(c), _board(c)),
                 notes=(hardly,) if together else (),
             ),
             Part(
@@ -92,6 +98,14 @@ def outcome_of(
                 "field",
                 "Field",
                 blocks=(_field_block(c, [Path(path) for path in paths]), *field_plots(c)),
+            ),
+            Part(
+                "uncertainty",
+                "Projection uncertainty",
+                (PROJECTION_TEXT,),
+                blocks=panels(*(uncertainty_plot(c, one) for one in distances)),
+                tables=(_projection(c, distances),),
+                menu="Uncertainty",
             ),
             Part(
                 "images",
@@ -134,6 +148,42 @@ def _intrinsics(c: CameraCalibration) -> Table:
         )
         rows.append(Row(INTRINSIC_WORDS.get(name, name), (*cells, unit)))
     return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
+
+
+def _board(c: CameraCalibration) -> Table:
+    """Table of the board's deviations from its file: estimated, or tested only."""
+    rows: list[Row] = []
+    for one in (*((c.bend,) if c.bend else ()), *c.deviations):
+        sides = (" along x", " along y") if len(one.value) > 1 else ("",)
+        for side, value, sigma in zip(
+            sides, one.value.tolist(), np.sqrt(np.diag(one.covariance)).tolist(), strict=True
+        ):
+            factor, unit = (100.0, "%") if one.code == "stretch" else (1e3, "mm")
+            places = decimals(sigma * factor)
+            state = "estimated" if one is c.bend else Chance(one.chance)
+            cells = (number(value * factor, places, signed=True), brief(sigma * factor), unit)
+            rows.append(Row(f"{one.code}{side}", (*cells, state)))
+    note = (
+        "Estimated, or the values that these would have if they were, with the probability of as"
+        " large ones by chance. Bend: out of the plane, of the middle from the border. Stretch: of"
+        " x against y."
+    )
+    columns = ("The board beside its file", "value", "1σ", "unit", "chance")
+    return Table("", columns, tuple(rows), note, brief=c.bend is not None, words=(3,))
+
+
+def _projection(c: CameraCalibration, distances: Sequence[float]) -> Table:
+    """Table of the projection's standard deviation over the image."""
+    rows: list[Row] = []
+    for distance in distances:
+        sigma = c.projection_map(distance)
+        finite = sigma[np.isfinite(sigma)]
+        middle = float(c.projection_sigma(c.camera.center, distance))
+        name = f"{brief(distance)} m" if np.isfinite(distance) else "infinity"
+        cells = (middle, float(np.median(finite)), float(finite.max()))
+        rows.append(Row(name, tuple(map(brief, cells))))
+    columns = ("Distance", "centre, px", "median, px", "worst, px")
+    return Table("Standard deviation of a point's pixel", columns, tuple(rows))
 
 
 def _compared(c: CameraCalibration) -> Table:

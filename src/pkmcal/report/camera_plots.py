@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pkmcal.arrays import Array
 from pkmcal.camera_calibration.calibrate import CameraCalibration, coverage
 from pkmcal.outcome.blocks.base import configuration_key
 from pkmcal.outcome.blocks.plot import (
@@ -39,29 +40,63 @@ def field_plots(c: CameraCalibration) -> tuple[Panels, ...]:
 
 def coverage_plot(c: CameraCalibration) -> Plot:
     """Number of corners in each cell of the image."""
-    width, height = c.camera.image_size
     counts = coverage(c.pixels[c.inliers], c.camera.image_size, COVERAGE_CELLS)
-    rows, columns = counts.shape
     most = max(int(counts.max()), 1)
+    return image_map(
+        "coverage",
+        "Corners by their place in the image",
+        f"{np.count_nonzero(counts)} of {counts.size} cells of the image hold corners, the"
+        f" fullest {most}",
+        c.camera.image_size,
+        np.where(counts > 0, counts, np.nan),
+        "corners",
+    )
+
+
+def uncertainty_plot(c: CameraCalibration, distance: float) -> Plot:
+    """Map of the projection's standard deviation at a distance."""
+    sigma = c.projection_map(distance)
+    where = f"at {brief(distance)} m" if np.isfinite(distance) else "at infinity"
+    finite = sigma[np.isfinite(sigma)]
+    return image_map(
+        f"uncertainty-{'near' if np.isfinite(distance) else 'infinity'}",
+        f"Projection uncertainty {where}",
+        f"1σ from {brief(float(finite.min(initial=np.inf)))} to"
+        f" {brief(float(finite.max(initial=0.0)))} px over the image",
+        c.camera.image_size,
+        sigma,
+        "1σ, px",
+    )
+
+
+def image_map(
+    name: str, title: str, alt: str, image_size: tuple[int, int], values: Array, label: str
+) -> Plot:
+    """Map of values (rows, columns) in the cells of an image, NaN for none."""
+    width, height = image_size
+    rows, columns = values.shape
+    most = float(np.nanmax(values, initial=0.0)) or 1.0
     x, y = (-0.5, width - 0.5), (-0.5, height - 0.5)
     return Plot(
-        name="coverage",
-        title="Corners by their place in the image",
+        name=name,
+        title=title,
         caption="",
-        alt=f"{np.count_nonzero(counts)} of {counts.size} cells of the image hold corners, the"
-        f" fullest {most}",
+        alt=alt,
         x=linear_axis("x, pixels", x).model_copy(update={"limits": x}),
         y=linear_axis("y, pixels", y).model_copy(update={"limits": (y[1], y[0])}),
         marks=(
             CellsMark(
                 x=x,
                 y=y,
-                values=tuple(tuple(float(n) or None for n in line) for line in counts.tolist()),
+                values=tuple(
+                    tuple(rounded(v) if np.isfinite(v) else None for v in line)
+                    for line in values.tolist()
+                ),
                 columns=tuple(f"column {k + 1}" for k in range(columns)),
                 rows=tuple(f"row {k + 1}" for k in range(rows)),
             ),
         ),
-        colours=ColourScale(label="corners", limits=(0, most), ticks=linear_ticks(0, most)),
+        colours=ColourScale(label=label, limits=(0, most), ticks=linear_ticks(0, most)),
         equal=True,
     )
 

@@ -23,7 +23,7 @@ MOST_WORST_POSES = 12
 """Poses in the list of the worst."""
 POSE_JUMPS_TEXT = (
     "Bars by configuration: a jump that stays means that something was moved, a single tall bar"
-    " that this one image, or its readings, are wrong."
+    " that this one measurement, or its readings, are wrong."
 )
 
 

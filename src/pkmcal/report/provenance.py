@@ -105,11 +105,11 @@ def stations(session: Session, observation: Observation, estimate: Estimate) -> 
         )
     columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
     columns += ("Edge shift, px",) if edges else ()
-    columns += ("Away from the pose by hand", "Camera")
-    table = Table(
-        "Where the cameras stood", columns, tuple(rows), brief=False, words=(len(columns) - 1,)
-    )
-    return Part("stations", "Cameras", tables=(table,))
+    what = "Camera" if session.stations else "Tracker"
+    columns += ("Away from the pose by hand", what)
+    title = f"Where the {what.lower()}s stood"
+    table = Table(title, columns, tuple(rows), brief=False, words=(len(columns) - 1,))
+    return Part("stations", f"{what}s", tables=(table,))
 
 
 def _pose_cells(estimate: Estimate, s: int) -> tuple[str, str, str, str]:

@@ -56,9 +56,10 @@ def section(
     change, spread = start_enlargements(extent_of(machine, first), centres)
     block = Space(
         title="",
-        caption=_caption(len(some), len(used)),
-        alt="The calibrated machine in three dimensions with its tubes, the fields of view of its"
-        " cameras, the measured poses, and the joint centres of the nominal model.",
+        caption=_caption(len(some), len(used), imaged=bool(session.stations)),
+        alt="The calibrated machine in three dimensions with"
+        + (" its tubes, the fields of view of its cameras," if session.stations else "")
+        + " the measured poses, and the joint centres of the nominal model.",
         machine=machine_shape(
             machine,
             leg_rows(machine, sigma),
@@ -85,14 +86,15 @@ def section(
     return Part("geometry", "The machine in space", blocks=(block,), menu="Geometry")
 
 
-def _caption(drawn: int, used: int) -> str:
+def _caption(drawn: int, used: int, *, imaged: bool) -> str:
     """Sentences below the stage."""
     fewer = f" of {used}, evenly chosen" if drawn < used else ""
     return (
         "True to scale, except for the change of the joint centres from the nominal model (blue)"
         f" and their {ELLIPSOID_SIGMAS:g}σ ellipsoids, which are enlarged by the sliders."
-        f" The slider takes the machine through {count(drawn, 'pose')}{fewer}; a click on a pose's"
-        " point leads to its images, and the space bar changes between nominal model and result."
+        f" The slider takes the machine through {count(drawn, 'pose')}{fewer};"
+        + (" a click on a pose's point leads to its images, and" if imaged else "")
+        + " the space bar changes between nominal model and result."
     )
 
 

@@ -22,7 +22,8 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
 from pkmcal.measurements.effects import FOCAL_SIGMA
 from pkmcal.mechanisms import Machine
-from pkmcal.placement.configurations import draw_configurations, platform_unfolded
+from pkmcal.mechanisms.kinematics import driven_towards
+from pkmcal.placement.configurations import draw_configurations, platform_unfolded, same_mode
 from pkmcal.placement.stations import (
     StationPose,
     default_stations,
@@ -244,6 +245,7 @@ def _configurations(
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
     by_nominal = nominal.forward_result(joints)
     reached = by_nominal.converged & platform_unfolded(nominal, by_nominal.T_base_platform)
+    reached &= same_mode(by_nominal.T_base_platform, poses)
     poses, joints = poses[reached], joints[reached]
     in_view = np.stack(
         [
@@ -312,7 +314,7 @@ def _at_requested(
 ) -> tuple[Array, Array, Integers]:
     """Poses of the true machine at the requested readings, the readings and their pairs."""
     by_nominal = nominal.forward_result(request.joints)
-    fk = machine.forward_result(request.joints, by_nominal.T_base_platform)
+    fk = driven_towards(machine.layout, machine.values, request.joints, by_nominal.T_base_platform)
     bad = np.flatnonzero(~(fk.converged & by_nominal.converged))
     if bad.size:
         raise GeometryError(
@@ -320,7 +322,7 @@ def _at_requested(
             found=", ".join(f"{q:.4g}" for q in request.joints[bad[0]]),
             expected="readings at which all legs reach the platform",
         )
-    return fk.T_base_platform, request.joints, request.pairs
+    return fk.T_base_platform, fk.readings, request.pairs
 
 
 def truth_document(truth: Truth) -> dict[str, Any]:

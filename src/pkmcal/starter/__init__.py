@@ -59,6 +59,16 @@ MOVED_STATION_TEXT = """\
     images: images/{name}/{{configuration}}.png
     observe: {observe}
 """
+READINGS_ALONE_HEADER_TEXT = """\
+# A calibration session: which machine, which readings.
+#
+# What to do, in this order:
+#   1. mechanism.yaml      the nominal model of your machine
+#   2. Move the machine to a configuration, wait until it stands still, and note what the encoders
+#      read, not what was commanded. 30 configurations or more, all over what it reaches.
+#   3. joints.csv          the readings: one row a configuration, in metres (or radians)
+#   4. pkmcal check, in this folder's place, until it finds nothing wrong; then pkmcal calibrate
+"""
 READINGS_ALONE_TEXT = """\
 # No stations: this machine has more readings than freedoms, and they alone determine its geometry.
 # Spread the configurations over all that it reaches.
@@ -202,7 +212,8 @@ def _session_text(text: str, hexapod: bool, turns: bool, what: ObservedChoice, p
         start, end = text.index("  # Standard deviation"), text.index("\n# One entry")
         text = text[:start] + DRIVE_NOISE_TEXT + text[end:]
     if what == "readings":
-        return text[: text.index("# One entry")] + READINGS_ALONE_TEXT
+        text = text[text.index("pkmcal: 1") : text.index("# One entry")]
+        return READINGS_ALONE_HEADER_TEXT + text + READINGS_ALONE_TEXT
     start, end = text.index("    observe: legs"), text.index("#  left:")
     first = f"    observe: {OBSERVE_ENTRY_VALUES[what]}\n"
     if what == "legs":

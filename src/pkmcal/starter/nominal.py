@@ -107,7 +107,8 @@ class NominalModel:
     heading : paragraphs of the file's first comment. numbers : lines of a comment for each number
     that it is made of. home : (3,) position of the platform, m, without rotation. tube_radius : of
     every leg's cylinder, None for legs without. assumed : names of numbers that were not given.
-    home_entry : the file's home; ``home`` to the micrometre by default.
+    sigma : standard deviation of the numbers, m; None for that of a ruler. home_entry : the
+    file's home; ``home`` to the micrometre by default.
     """
 
     name: str
@@ -119,6 +120,7 @@ class NominalModel:
     tube_radius: float | None = None
     assumed: tuple[str, ...] = ()
     home_entry: str = ""
+    sigma: float | None = None
 
     __repr__ = short_repr
 
@@ -129,13 +131,12 @@ class NominalModel:
             lines += ["", first, *(f"  {line}" for line in rest)]
         home = self.home_entry or f"{{position: {_numbers(self.home)}}}"
         frames = "# Base joints in the base frame, platform joints in the platform frame"
-        frames += (
-            ".\n# "
-            if self.home_entry
-            else (", which has the same\n# directions at home; z is up. ")
-        )
+        same = ", which has the same\n# directions at home; z is up. "
+        frames += ".\n# " if self.home_entry else same
         comment = "\n".join(f"# {line}".rstrip() for line in lines)
-        sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
+        sigma = self.sigma
+        if sigma is None:
+            sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
         return (
             f"{comment}\nname: {self.name}\nmotion: {self.motion}\n\n"
             f"{frames}Replace any centre by a better one.\nlegs:\n"

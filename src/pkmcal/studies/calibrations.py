@@ -51,7 +51,7 @@ from pkmcal.measurements.effects import SHIFT_SIGMA, lines
 from pkmcal.measurements.poses import PoseData
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.mechanisms.kinematics import forward
+from pkmcal.mechanisms.kinematics import ForwardResult, driven_towards, forward
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.placement.edges import EDGE_TURN_POINTS, moved_outward
 from pkmcal.solver.search import Stop, take
@@ -136,15 +136,15 @@ class SimulatedCalibrations:
         design, rng = self.design, batch.generator(0)
         # Truth and readings; one problem with the structure of the plan for all runs.
         capture = captured(design, batch.generator(IMAGE_PLAN_STREAM))
-        theta, poses, internal = _machines(design, capture, batch.runs, rng)
-        readings = capture.joints + design.reading_noise * rng.standard_normal(
-            (batch.runs, *capture.joints.shape)
-        )
+        theta, true = _machines(design, capture, batch.runs, rng)
+        poses, internal = true.T_base_platform, true.internal
+        noise = rng.standard_normal((batch.runs, *capture.joints.shape))
+        readings = true.readings + design.reading_noise * noise
         template = assemble(capture.machine, capture.measurements(design.reading_noise), self.gauge)
         problem = template.problem
         data = replace(problem.data, joints=readings[:, template.observed])
         if len(capture.edges):
-            data = _measured_edges(design, capture, template, theta, poses, internal, rng)
+            data = _measured_edges(design, capture, template, theta, true, rng)
             data = replace(data, joints=readings[:, template.observed])
         pose_data = problem.pose_data
         if len(capture.views):
@@ -277,18 +277,19 @@ def tool_error_and_sigma(
     registered = changed_frames(machine.layout, true, *alignment(calibrated, true, BestFit()))
     there = replace(true, theta=theta)
     keep = transformation(calibrated, there, BestFit())[:n, :n]
-    # Forward kinematics of the result and of the truth at the same readings.
+    # Forward kinematics of the truth, and of the result at the truth's readings.
     home = np.broadcast_to(machine.home(), (len(joints), 4, 4))
     nominal_fk = forward(machine.layout, machine.parameters.nominal, joints, home)
-    calibrated_fk = forward(
-        machine.layout, theta, joints, nominal_fk.T_base_platform, nominal_fk.internal
-    )
-    true_fk = forward(
+    true_fk = driven_towards(
         machine.layout,
         registered.theta,
         joints,
-        calibrated_fk.T_base_platform,
-        calibrated_fk.internal,
+        nominal_fk.T_base_platform,
+        nominal_fk.internal,
+    )
+    joints = true_fk.readings
+    calibrated_fk = forward(
+        machine.layout, theta, joints, true_fk.T_base_platform, true_fk.internal
     )
     good = calibrated_fk.converged & true_fk.converged
     # Error and its covariance, both without the components that are changes of frames.
@@ -331,9 +332,9 @@ def _truth(data: SimulatedSessions, run: int) -> State:
 
 def _machines(
     design: Design, capture: Capture, runs: int, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
-    """Draw true machines (B, P) by the prior sigmas, with their poses (B, K, 4, 4) and hinges at
-    the plan's readings.
+) -> tuple[Array, ForwardResult]:
+    """Draw true machines (B, P) by the prior sigmas, driven towards the plan's readings: their
+    poses (B, K, 4, 4) and their own readings (B, K, m).
 
     A machine that cannot take the readings is drawn again; ResultError after TIMES_MACHINES_REDRAWN
     attempts.
@@ -344,12 +345,13 @@ def _machines(
     theta = np.empty((runs, len(table)))
     poses = np.empty((runs, *start.T_base_platform.shape))
     internal = np.empty((runs, *start.internal.shape))
+    readings, error = np.empty((runs, *capture.joints.shape)), np.empty((runs, len(capture.joints)))
     remaining = np.arange(runs)
     for _ in range(TIMES_MACHINES_REDRAWN):
         # Draw the remaining machines, and keep those that close at all readings.
         step = tolerance * rng.standard_normal((len(remaining), len(tolerance)))
         theta[remaining] = table.unit_axes(table.nominal + step @ free.T)
-        fk = forward(
+        fk = driven_towards(
             machine.layout,
             theta[remaining, None],
             capture.joints,
@@ -357,9 +359,13 @@ def _machines(
             start.internal,
         )
         poses[remaining], internal[remaining] = fk.T_base_platform, fk.internal
+        readings[remaining], error[remaining] = fk.readings, fk.error
         remaining = remaining[~fk.converged.all(axis=1)]
         if not remaining.size:
-            return theta, poses, internal
+            closed = np.ones(error.shape, dtype=bool)
+            return theta, ForwardResult(
+                poses, closed, error, internal, machine.layout, theta[:, None], readings
+            )
     raise ResultError(
         "machines within the nominal model's tolerances cannot take the readings of the plan",
         found=f"{remaining.size} of {runs} machines, drawn {TIMES_MACHINES_REDRAWN} times",
@@ -372,14 +378,15 @@ def _measured_edges(
     capture: Capture,
     template: Assembled,
     theta: Array,
-    poses: Array,
-    internal: Array,
+    true: ForwardResult,
     rng: np.random.Generator,
 ) -> EdgeData:
     """Edge measurements of all runs, at their places in the problem."""
     machine, edges, at = capture.machine, capture.edges, template.places.edges
     blocks, runs, n = template.problem.blocks, len(theta), len(capture.edges)
-    ends = limb_ends(machine.layout, theta[:, None], capture.joints, poses, internal)
+    ends = limb_ends(
+        machine.layout, theta[:, None], true.readings, true.T_base_platform, true.internal
+    )
     radius = theta[:, blocks.radius[at.row, at.place]]
     normal, basis, first = np.empty((runs, n, 3)), np.empty((runs, n, 3, 2)), np.empty((runs, n, 3))
     by_shift, by_tilt = np.empty((2, runs, n, 2))

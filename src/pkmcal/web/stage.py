@@ -108,7 +108,7 @@ def configurations(machine: Machine, postures: Postures) -> list[shapes.Configur
         q, legs = readings[n], list[shapes.LegConfiguration]()
         positive = _positive_paths(machine, q, a[n], b[n], extent)
         for j, (leg, zero) in enumerate(zip(plain.legs, zeros, strict=True)):
-            if machine.layout.rod_reads[j]:
+            if machine.layout.lengthens[j]:
                 along = b[n, j] - a[n, j]
                 zero = (a[n, j] + offsets[j] * along / np.linalg.norm(along))[None]
             elif machine.layout.actuated[j] < 0:
@@ -168,7 +168,7 @@ def _positive_paths(machine: Machine, q: Array, a: Array, b: Array, extent: floa
     for j in np.flatnonzero(layout.actuated >= 0).tolist():
         along = b[j] - a[j]
         u = along / np.linalg.norm(along)
-        if layout.rod_reads[j]:
+        if layout.lengthens[j]:
             arrow = a[j] + 0.5 * along + shares[[0, -1]] * size["m"] * u
         else:
             arrow = paths[:, j]
@@ -176,7 +176,7 @@ def _positive_paths(machine: Machine, q: Array, a: Array, b: Array, extent: floa
         ahead = ahead / np.linalg.norm(ahead)
         if np.abs(np.cross(arrow - arrow[0], ahead)).max() < 1e-6 * extent:
             # the side on which the rod is not; beside the rod itself, away from the machine's axis
-            sideways = np.cross(ahead, [0.0, 0.0, 1.0]) if layout.rod_reads[j] else -u
+            sideways = np.cross(ahead, [0.0, 0.0, 1.0]) if layout.lengthens[j] else -u
             sideways = sideways - (sideways @ ahead) * ahead
             if np.linalg.norm(sideways) < 1e-3:
                 sideways = np.cross(ahead, [1.0, 0.0, 0.0])
@@ -385,7 +385,7 @@ def _readings(machine: Machine, ranges: Array) -> tuple[shapes.Reading, ...]:
 
 def _sense(machine: Machine, j: int, chain: Chain | None) -> tuple[str, str]:
     """What a larger reading of leg j does, and where the reading is zero."""
-    if machine.layout.rod_reads[j]:
+    if machine.layout.lengthens[j]:
         offset = float(machine.values[machine.layout.rod[j]])
         length = "0" if abs(offset) < SAME_POINT else f"{number(offset * 1e3, 2)} mm"
         return "makes the leg longer", f"leg length {length}"

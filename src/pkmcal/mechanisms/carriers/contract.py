@@ -327,6 +327,42 @@ class BaseCarrier(Carrier, ABC):
         return np.stack(np.broadcast_arrays(*points), axis=-2)
 
 
+class Winding(ABC):
+    """Addition to a base carrier whose limb is a cable: its free part begins at a point A that
+    depends on the platform's end B, and a part of its length lies on a pulley.
+
+    The free cable touches the pulley, so that by B the whole length changes along the free cable's
+    direction, as a rod's does.
+    """
+
+    @staticmethod
+    @abstractmethod
+    def tangent_point(parameters: Array, point_b: Array) -> tuple[Array, Array]:
+        """Point A (..., 3) and the length (...,) of the cable from the carrier's place to it, m.
+
+        parameters : (..., n). point_b : (..., 3). NaN where the cable cannot reach B.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def tangent_by_b(parameters: Array, point_b: Array) -> Array:
+        """Derivative (..., 3, 3) of A by B."""
+
+    @classmethod
+    @abstractmethod
+    def tangent_by_parameters(cls, parameters: Array, point_b: Array) -> tuple[Array, Array]:
+        """Derivatives (..., 3, n) of A and (..., n) of the length up to A, at a fixed B."""
+
+    @staticmethod
+    def paid_out(parameters: Array, readings: Array) -> tuple[Array, Array, Array]:
+        """Length (...,) by which the reading makes the cable longer than its rod, with derivatives
+        by the reading (...,) and by the parameters (..., n). By default none: the rod is read.
+        """
+        shape = np.broadcast_shapes(parameters.shape[:-1], readings.shape)
+        zero = np.zeros(shape)
+        return zero, zero, np.zeros((*shape, parameters.shape[-1]))
+
+
 class PlatformCarrier(Carrier, ABC):
     """Carrier of B, the limb's end on the platform side, as a function of the platform's pose.
 

@@ -1,0 +1,150 @@
+"""Centres of a grid of circles in one image.
+
+The image of a circle is an ellipse whose centroid is not the image of the circle's centre: at a
+tilt of 45 degrees they differ by tenths of a pixel. Each circle is therefore resampled into the
+board's plane by the homography of its neighbours, where it is a circle again; the centroid of its
+grey levels there is the centre, also of blurred circles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.boards.board import Board
+
+
+@dataclass(frozen=True)
+class CircleOptions:
+    """Constants of the detection of circles."""
+
+    # least area of a circle, px: a smaller one has no inside
+    least_area: float = 20.0
+    # neighbours, the circle included, of which the homography of a circle is fitted
+    neighbours: int = 9
+    # samples across a circle's surroundings in the board's plane
+    samples: int = 41
+    # passes: the homographies of the second are of the centres of the first
+    passes: int = 3
+    # inner edge of the ring of paper around a circle, as a share of half the distance to the next
+    ring: float = 0.85
+    # least difference between circle and paper, grey levels, and in standard deviations of the
+    # paper
+    least_contrast: float = 15.0
+    least_contrast_sigmas: float = 4.0
+
+
+CIRCLE_OPTIONS = CircleOptions()
+
+
+def find_circles(
+    image: Integers, board: Board, options: CircleOptions = CIRCLE_OPTIONS
+) -> Array | None:
+    """Rough centres (N, 2) px in the board's order; None if the grid is not detected."""
+    columns, rows = board.counts
+    for centres in _attempts(image, board, options):
+        grid = centres.reshape(rows, columns, 2)
+        right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+        if right[0] * down[1] - right[1] * down[0] > 0:
+            return grid.reshape(-1, 2)
+        if not board.document.get("asymmetric", False):
+            return grid[:, ::-1].reshape(-1, 2)
+    return None
+
+
+def circle_centres(
+    image: Integers, board: Board, start: Array, options: CircleOptions = CIRCLE_OPTIONS
+) -> tuple[Array, Booleans, Array]:
+    """Centres (N, 2) px from rough ones, whether each is reliable (N,), and sigma (N,) px."""
+    xy = board.points[:, :2]
+    gap = np.linalg.norm(xy[:, None] - xy, axis=-1)
+    order = np.argsort(gap, axis=1, kind="stable")[:, : options.neighbours]
+    half = float(np.min(gap + np.where(np.eye(len(xy)) > 0, np.inf, 0.0))) / 2
+    centres = start.astype(float)
+    good, sigma = np.zeros(len(xy), dtype=bool), np.zeros(len(xy))
+    for _ in range(options.passes):
+        measured = [
+            _centre(image, xy[i], _homography(xy[near], centres[near]), half, options)
+            for i, near in enumerate(order)
+        ]
+        good = np.array([one is not None for one in measured])
+        centres = np.array(
+            [old if one is None else one[0] for old, one in zip(centres, measured, strict=True)]
+        )
+        sigma = np.array([0.0 if one is None else one[1] for one in measured])
+    return centres, good, sigma
+
+
+def _attempts(image: Integers, board: Board, options: CircleOptions) -> Iterator[Array]:
+    """Centres (N, 2) by OpenCV's detector, of dark circles, then of light ones."""
+    import cv2
+
+    kind = (
+        cv2.CALIB_CB_ASYMMETRIC_GRID
+        if board.document.get("asymmetric", False)
+        else cv2.CALIB_CB_SYMMETRIC_GRID
+    )
+    settings: Any = cv2.SimpleBlobDetector.Params()
+    settings.minArea = options.least_area
+    settings.maxArea = image.size / len(board.points)
+    settings.minDistBetweenBlobs = float(np.sqrt(options.least_area))
+    blobs: Any = cv2.SimpleBlobDetector.create(settings)
+    for picture in (image, 255 - image):
+        for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
+            success, centres = cv2.findCirclesGrid(
+                picture, board.counts, flags=flags, blobDetector=blobs
+            )
+            if success and centres is not None:
+                yield np.asarray(centres, dtype=float).reshape(-1, 2)
+
+
+def _homography(xy: Array, pixels: Array) -> Array:
+    """Homography (3, 3) from the board's plane, m, to pixels, by least squares."""
+    import cv2
+
+    H: Any = cv2.findHomography(xy, pixels, 0)[0]
+    return np.full((3, 3), np.nan) if H is None else H
+
+
+def _centre(
+    image: Integers, xy: Array, H: Array, half: float, options: CircleOptions
+) -> tuple[Array, float] | None:
+    """Centre (2,) px and its standard deviation; None where no circle stands out from the paper.
+
+    xy : (2,) m, place on the board. half : half the distance to the nearest circle, m.
+    """
+    import cv2
+
+    axis = np.linspace(-half, half, options.samples)
+    offsets = np.stack(np.meshgrid(axis, axis), axis=-1)
+    radius = np.linalg.norm(offsets, axis=-1) / half
+    pixels = _projected(H, xy + offsets)
+    last = np.array(image.shape[::-1]) - 1
+    if not np.isfinite(pixels).all() or (pixels < 0).any() or (pixels > last).any():
+        return None
+    x, y = np.moveaxis(pixels.astype(np.float32), -1, 0)
+    grey = np.asarray(cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR))
+    paper = grey[(radius > options.ring) & (radius <= 1)]
+    # bilinear interpolation leaves two thirds of the pixels' standard deviation, on average
+    level, noise = float(np.median(paper)), 1.5 * float(np.std(paper))
+    contrast = level - float(np.median(grey[radius < 0.2]))
+    if abs(contrast) < max(options.least_contrast, options.least_contrast_sigmas * noise):
+        return None
+    share = np.where(radius <= 1, (level - grey) / contrast, 0.0)
+    total = float(share.sum())
+    offset = np.sum(share[..., None] * offsets, axis=(0, 1)) / total
+    # White noise of the pixels; their number in a sample cancels.
+    spread = float(np.sum(offsets[radius <= 1][:, 0] ** 2))
+    sigma = noise / abs(contrast) * np.sqrt(spread) / total / (axis[1] - axis[0])
+    centre = _projected(H, xy + offset)
+    return centre, float(max(sigma, 1e-4))
+
+
+def _projected(H: Array, xy: Array) -> Array:
+    """Pixels (..., 2) of points (..., 2) of the board's plane."""
+    h = xy @ H[:, :2].T + H[:, 2]
+    return h[..., :2] / h[..., 2:]

@@ -1,0 +1,229 @@
+"""Difference between two cameras: pixels of the same far points, after the best rotation.
+
+A calibration determines a camera only up to a rotation of its frame: a principal point that moves
+is almost a camera that turns. Rays of A are rotated such that B's pixels of them differ least.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, short_repr
+from pkmcal.camera_calibration.uncertainty import largest_sigma, pixel_grid
+from pkmcal.cameras.contract import Camera
+from pkmcal.cameras.files import load_camera
+from pkmcal.errors import InputError
+from pkmcal.files import json_value
+from pkmcal.geometry.rigid import rotation, rotation_vector, skew
+from pkmcal.judge.changes import CHANGE_ALPHA
+from pkmcal.judge.difference import DIFFERENCE_FORMAT
+from pkmcal.levels import NEGLIGIBLE, ROUNDING
+from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, note, wrong
+from pkmcal.wording import brief
+
+CAMERA_CELLS = (32, 24)
+"""Columns and rows of cells in which two cameras are compared."""
+ROTATION_STEPS = 50
+"""Most Gauss-Newton steps for the best rotation; two or three suffice for equal lenses."""
+
+
+@dataclass(frozen=True)
+class ComparedCamera:
+    """One of the two cameras. name : as given."""
+
+    name: str
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class CameraDifference:
+    """Difference between two cameras.
+
+    rotation : (3, 3) of A's rays into B's frame. pixels : (rows, columns, 2) of A, middles of
+    cells. difference : (rows, columns, 2) px, B's pixel minus A's; NaN where one has no ray. sigma
+    : (rows, columns) px, of the difference by chance in the worst direction; None if neither file
+    has a covariance. chance : p-value of as large a difference; None without sigma.
+    """
+
+    a: ComparedCamera
+    b: ComparedCamera
+    rotation: Array
+    pixels: Array
+    difference: Array
+    sigma: Array | None
+    chance: float | None
+    changed: bool
+    verdict: Verdict
+
+    __repr__ = short_repr
+
+    @property
+    def lengths(self) -> Array:
+        """Length of the difference (rows, columns), px."""
+        return np.linalg.norm(self.difference, axis=-1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: px and rad."""
+        return json_value(
+            {
+                "pkmcal_diff": DIFFERENCE_FORMAT,
+                "verdict": self.verdict.document(),
+                "changed": self.changed,
+                "cameras": [
+                    {"name": one.name, "camera": one.camera.document()} for one in (self.a, self.b)
+                ],
+                "rotation": rotation_vector(self.rotation),
+                "pixels": self.pixels,
+                "difference": self.difference,
+                "sigma": self.sigma,
+                "chance": self.chance,
+            }
+        )
+
+
+def camera_difference(a: Camera | Path | str, b: Camera | Path | str) -> CameraDifference:
+    """Compare two cameras of images of one size.
+
+    Raises InputError if their images have different sizes, or no ray of A has a pixel in B.
+    """
+    one, other = _compared(a), _compared(b)
+    if tuple(one.camera.image_size) != tuple(other.camera.image_size):
+        raise InputError(
+            "the two cameras have images of different sizes",
+            where=other.name,
+            found=f"{other.camera.image_size[0]} x {other.camera.image_size[1]}",
+            expected=f"{one.camera.image_size[0]} x {one.camera.image_size[1]}, as in {one.name}",
+        )
+    pixels = pixel_grid(one.camera.image_size, CAMERA_CELLS)
+    rays = one.camera.ray(pixels)
+    both = np.asarray(np.isfinite(rays + other.camera.project(rays)[..., :1]).all(axis=-1))
+    if not both.any():
+        raise InputError(
+            "the two cameras have no direction in common",
+            where=other.name,
+            expected=f"a camera whose field overlaps that of {one.name}",
+        )
+    # Weight of each cell by the standard deviation of its pixels, equal without covariances.
+    spread = _spread(one.camera, other.camera, pixels[both], rays[both], np.eye(3))
+    sigma_each = np.sqrt(np.sum(spread**2, axis=(-1, -2)) / 2)
+    floor = NEGLIGIBLE * float(np.median(sigma_each))
+    weight = 1 / np.maximum(sigma_each, floor) if floor > 0 else np.ones(len(spread))
+    R = best_rotation(other.camera, rays[both], pixels[both], weight)
+    # Cells whose rotated rays B does not see are left out.
+    visible = np.isfinite(other.camera.project(rays[both] @ R.T)).all(axis=-1)
+    both[both], weight = visible, weight[visible]
+    rotated = rays[both] @ R.T
+    off = other.camera.project(rotated) - pixels[both]
+    difference = np.full(pixels.shape, np.nan)
+    difference[both] = off
+    sigma, chance = None, None
+    if floor > 0:
+        spread = _spread(one.camera, other.camera, pixels[both], rays[both], R)
+        spread = _without_rotation(spread, other.camera, rotated, weight)
+        sigma = np.full(pixels.shape[:-1], np.nan)
+        sigma[both] = largest_sigma(spread @ spread.mT)
+        chance = _p_value(off, spread, weight)
+    largest = float(np.linalg.norm(off, axis=-1).max())
+    changed = chance < CHANGE_ALPHA if chance is not None else largest > ROUNDING
+    out = CameraDifference(
+        one, other, R, pixels, difference, sigma, chance, bool(changed), Verdict(True, "")
+    )
+    return _with_verdict(out, largest)
+
+
+def best_rotation(camera: Camera, rays: Array, pixels: Array, weight: Array) -> Array:
+    """Rotation (3, 3) by which rays (n, 3) have pixels (n, 2) in a camera, by least squares.
+
+    weight : (n,) one over the standard deviation.
+    """
+    R = np.eye(3)
+    for _ in range(ROTATION_STEPS):
+        turned = rays @ R.T
+        by_rotation, off = _by_rotation(camera, turned), camera.project(turned) - pixels
+        good = np.isfinite(off).all(axis=-1)
+        w = weight[good, None]
+        rows = (w[..., None] * by_rotation[good]).reshape(-1, 3)
+        step = np.linalg.lstsq(rows, -(w * off[good]).reshape(-1), rcond=None)[0]
+        R = rotation(step) @ R
+        if np.linalg.norm(step) < ROUNDING:
+            break
+    return R
+
+
+def _compared(origin: Camera | Path | str) -> ComparedCamera:
+    if isinstance(origin, Camera):
+        return ComparedCamera(f"a {origin.model} camera", origin)
+    return ComparedCamera(str(origin), load_camera(origin))
+
+
+def _by_rotation(camera: Camera, rays: Array) -> Array:
+    """Derivatives (n, 2, 3) of pixels by a rotation of the rays (n, 3)."""
+    return -camera.project_jacobians(rays)[0] @ skew(rays)
+
+
+def _spread(a: Camera, b: Camera, pixels: Array, rays: Array, R: Array) -> Array:
+    """Root (n, 2, m) of the covariance of B's pixels by A's parameters, which move the rays, and
+    by B's; zero for a camera without a covariance.
+    """
+    by_ray, by_b = b.project_jacobians(rays @ R.T)
+    parts: list[Array] = []
+    for camera, by in ((a, by_ray @ R @ a.ray_jacobians(pixels)[1]), (b, by_b)):
+        n = len(camera.parameters)
+        covariance = np.zeros((n, n)) if camera.covariance is None else camera.covariance
+        values, vectors = np.linalg.eigh(covariance)
+        parts.append(by @ (vectors * np.sqrt(np.maximum(values, 0.0))))
+    return np.concatenate(parts, axis=-1)
+
+
+def _without_rotation(spread: Array, camera: Camera, rays: Array, weight: Array) -> Array:
+    """Columns of changes (n, 2, m) without the part that the best rotation takes away."""
+    w = weight[:, None, None]
+    basis = np.linalg.qr((w * _by_rotation(camera, rays)).reshape(-1, 3))[0]
+    flat = (w * spread).reshape(-1, spread.shape[-1])
+    return (flat - basis @ (basis.T @ flat)).reshape(spread.shape) / w
+
+
+def _p_value(off: Array, spread: Array, weight: Array) -> float:
+    """Probability of as large a weighted sum of squares of differences (n, 2) by chance.
+
+    The sum is one of chi-squares weighted by eigenvalues; a scaled chi-square with the same mean
+    and variance takes its place (Satterthwaite). spread : (n, 2, m) root of the covariance.
+    """
+    from scipy.special import gammaincc
+
+    flat = (weight[:, None, None] * spread).reshape(-1, spread.shape[-1])
+    normal = flat.T @ flat
+    mean, variance = float(np.trace(normal)), 2 * float(np.sum(normal**2))
+    total = float(np.sum((weight[:, None] * off) ** 2))
+    if total <= ROUNDING**2 or variance == 0:
+        return 1.0 if total <= ROUNDING**2 else 0.0
+    return float(gammaincc(mean**2 / variance, total * mean / variance))
+
+
+def _with_verdict(d: CameraDifference, largest: float) -> CameraDifference:
+    """Difference with its verdict."""
+    middle = float(np.nanmedian(d.lengths))
+    clause = f"{brief(middle)} px over the image (median), {brief(largest)} px at worst"
+    findings: list[Finding] = []
+    if largest <= ROUNDING:
+        headline = "The two cameras are the same: no pixel differs by more than rounding."
+    elif d.sigma is None:
+        headline = f"The cameras differ: {clause}."
+    else:
+        by_chance = f"; chance alone makes {brief(float(np.nanmedian(d.sigma)))} px (1σ)"
+        headline = (
+            f"The cameras differ by more than chance explains: {clause}{by_chance}."
+            if d.changed
+            else f"No difference beyond what chance explains: {clause}{by_chance}."
+        )
+    if d.changed:
+        findings.append(wrong("difference.cameras", d.b.name, value=middle, largest=largest))
+    without = [one.name for one in (d.a, d.b) if one.camera.covariance is None]
+    if without:
+        findings.append(note("difference.no_covariance", names=without))
+    return replace(d, verdict=Verdict(not d.changed, headline, tuple(findings)))

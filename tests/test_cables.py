@@ -1,0 +1,252 @@
+"""Cables over pulleys and on spools: lengths, derivatives, kinematics and calibration."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from pkmcal.cameras.pinhole import Pinhole
+from pkmcal.errors import InputError
+from pkmcal.files import parse_yaml, yaml_text
+from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
+from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.mechanisms.carriers.pulley import Pulley, Spool
+from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.simulation.truth import true_machine
+from pkmcal.studies.calibrations import SimulatedCalibrations
+from pkmcal.studies.capture import Design
+from pkmcal.studies.tasks import Batch
+from test_identify_residuals import check
+
+CORNERS = np.array(
+    [[x, y, z] for z in (2.0, -2.0) for x, y in ((3, 2), (3, -2), (-3, -2), (-3, 2))]
+)
+JOINTS = np.array(
+    [
+        [x, y, z]
+        for z in (0.2, -0.2)
+        for x, y in ((0.1, 0.4), (0.1, -0.4), (-0.1, -0.4), (-0.1, 0.4))
+    ]
+)
+
+
+def base(kind, corner):
+    center = [float(x) for x in corner]
+    if kind == "pulley":
+        return {"joint": "pulley", "center": center, "axis": [0.1, 0.05, 1.0], "radius": 0.04}
+    spool = {"joint": "spool", "center": center, "spool": 0.075, "gear": -12.75, "lines": 2.0}
+    spool |= {"buildup": 1e-4, "range": [-1500.0, 1500.0]}
+    if kind == "spool over pulley":
+        spool |= {"axis": [0.1, 0.05, 1.0], "radius": 0.04}
+    return spool
+
+
+def cables(folder, kind, name="cables"):
+    """A robot with eight cables."""
+    length = {"actuated": True, "range": [0.5, 7.0]}
+    if kind != "pulley":
+        length = {"actuated": False, "constant": 3.5}
+    legs = [
+        {
+            "base": base(kind, a),
+            "platform": {"joint": "spherical", "center": [float(x) for x in b]},
+            "length": length,
+        }
+        for a, b in zip(CORNERS, JOINTS, strict=True)
+    ]
+    document = {
+        "name": name,
+        "motion": "spatial",
+        "legs": legs,
+        "home": {"position": [0.0, 0.0, 0.0]},
+        "tolerance": {"center": 0.01, "offset": 0.02, "arm": 0.0003},
+    }
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml_text(document), encoding="utf-8")
+    return load_mechanism(path)
+
+
+def around_home(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return pose(rotation(rng.uniform(-0.3, 0.3, (n, 3))), rng.uniform(-0.9, 0.9, (n, 3)))
+
+
+KINDS = ("pulley", "spool", "spool over pulley")
+
+
+def length_by_search(center, axis, radius, b):
+    """Length of a cable that lies on the pulley and goes straight on, by a search for the point at
+    which its direction is the pulley's tangent.
+    """
+    s = axis / np.linalg.norm(axis)
+    across = (b - center) - ((b - center) @ s) * s
+    e = across / np.linalg.norm(across)
+    middle = center + radius * e
+
+    def point(t):
+        return middle + radius * (-e * np.cos(t) + s * np.sin(t))
+
+    def off_tangent(t):
+        outward = -e * np.cos(t) + s * np.sin(t)
+        return (b - point(t)) @ outward
+
+    # of both tangents, the one in whose direction the cable came
+    grid = np.linspace(-np.pi / 2 + 1e-9, 1.5 * np.pi - 1e-9, 400)
+    for low, high in pairwise(grid):
+        if off_tangent(low) * off_tangent(high) < 0:
+            t = brentq(off_tangent, low, high, xtol=1e-15)
+            ahead = e * np.sin(t) + s * np.cos(t)
+            if (b - point(t)) @ ahead > 0:
+                return radius * t + np.linalg.norm(b - point(t)), point(t)
+    raise AssertionError("no tangent")
+
+
+def test_a_cable_over_a_pulley_is_as_long_as_a_search_finds():
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        parameters = np.concatenate([rng.normal(size=6), [rng.uniform(0.01, 0.1)]])
+        b = parameters[:3] + rng.normal(size=3)
+        length, point = length_by_search(parameters[:3], parameters[3:6], parameters[6], b)
+        a, wound = Pulley.tangent_point(parameters, b)
+        np.testing.assert_allclose(a, point, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(b - a) + wound, length, atol=1e-12)
+
+
+def test_a_spool_pays_out_what_its_radius_integrates_to():
+    """The radius falls with the cable paid out: dl/dphi = sqrt(R^2 - k l)."""
+    radius, buildup, turns = 0.05, 4e-5, 40.0
+    parameters = np.array([0, 0, 0, 0, 0, 1, 0, radius, 1.0, 1.0, buildup])
+    solved = solve_ivp(
+        lambda _, paid: np.sqrt(radius**2 - buildup * paid),
+        (0, turns),
+        [0.0],
+        rtol=1e-11,
+        atol=1e-13,
+    )
+    paid, rate, _ = Spool.paid_out(parameters, np.array(turns))
+    np.testing.assert_allclose(paid, solved.y[0, -1], rtol=1e-9)
+    np.testing.assert_allclose(rate, np.sqrt(radius**2 - buildup * paid), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_readings_and_poses_agree(tmp_path, kind):
+    machine, poses = cables(tmp_path, kind), around_home(20)
+    joints = machine.inverse(poses)
+    assert np.isfinite(joints).all()
+    assert np.abs(closure(machine.layout, machine.values, joints, poses).rows.value).max() < 1e-12
+    np.testing.assert_allclose(machine.forward(joints), poses, atol=1e-10)
+
+
+def differences(function, x, step):
+    """Central differences of the fourth order by each number of x."""
+    out = []
+    for k in range(len(x)):
+        d = np.zeros(len(x))
+        d[k] = step
+        far, near = function(x + 2 * d) - function(x - 2 * d), function(x + d) - function(x - d)
+        out.append((8 * near - far) / (12 * step))
+    return np.stack(out, axis=-1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_derivatives_of_the_closure(tmp_path, kind):
+    machine, poses = cables(tmp_path, kind), around_home(4, 1)
+    layout, theta = machine.layout, machine.values
+    joints = machine.inverse(poses) + 0.01
+    c = closure(layout, theta, joints, poses)
+
+    def value(theta=theta, joints=joints, delta=0.0):
+        return closure(layout, theta, joints, perturb(poses, delta + np.zeros(6))).rows.value
+
+    by_theta = differences(lambda x: value(theta=x), theta, 1e-4)
+    np.testing.assert_allclose(dense(c, len(theta)), by_theta, atol=2e-9)
+    by_pose = differences(lambda x: value(delta=x), np.zeros(6), 1e-4)
+    np.testing.assert_allclose(c.rows.by_pose, by_pose, atol=2e-9)
+    by_reading = differences(lambda x: value(joints=joints + x), np.zeros(1), 1e-3)[..., 0]
+    np.testing.assert_allclose(c.by_reading, by_reading, atol=2e-9)
+
+
+@pytest.mark.parametrize("kind", ["pulley", "spool over pulley"])
+def test_derivatives_of_the_point_that_the_cable_leaves(tmp_path, kind):
+    machine, poses = cables(tmp_path, kind), around_home(4, 2)
+    layout, theta = machine.layout, machine.values
+    joints = machine.inverse(poses)
+    c = closure(layout, theta, joints, poses)
+
+    def a(theta=theta, delta=0.0):
+        return closure(layout, theta, joints, perturb(poses, delta + np.zeros(6))).a
+
+    by_pose = differences(lambda x: a(delta=x), np.zeros(6), 1e-4)
+    np.testing.assert_allclose(c.a_by_b @ c.b_by_pose, by_pose, atol=2e-9)
+    by = np.zeros((*c.a.shape, len(theta) + 1))
+    for j in range(machine.n_legs):
+        by[:, j][..., layout.a_index[j]] += c.a_by[:, j]
+        by[:, j][..., layout.b_index[j]] += c.a_by_b[:, j] @ c.b_by[:, j]
+    by_theta = differences(lambda x: a(theta=x), theta, 1e-4)
+    np.testing.assert_allclose(by[..., :-1], by_theta, atol=2e-9)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "field"),
+    [
+        ("spool", {"radius": 0.04}, "radius"),
+        ("spool", {"axis": [0.0, 0.0, 1.0]}, "axis"),
+        ("spool", {"gear": 0.0}, "gear"),
+        ("pulley", {"radius": 0.0}, "radius"),
+    ],
+)
+def test_cables_that_are_no_cables(tmp_path, kind, change, field):
+    document = parse_yaml(mechanism_text(cables(tmp_path, kind)), tmp_path / "x.yaml").data
+    document["legs"][0]["base"] |= change
+    (tmp_path / "x.yaml").write_text(yaml_text(document), encoding="utf-8")
+    with pytest.raises(InputError) as error:
+        load_mechanism(tmp_path / "x.yaml")
+    assert field in str(error.value.where)
+
+
+@pytest.mark.parametrize("kind", ["pulley", "spool over pulley"])
+def test_derivatives_of_the_edges_of_cables(tmp_path, kind):
+    """The point that a cable leaves moves with the platform, and the edge with it."""
+    camera = Pinhole((1280, 960), np.array([900.0, 900.0, 639.5, 479.5, 0, 0, 0, 0, 0]))
+    design = Design(cables(tmp_path, kind), (camera,), stations=2, configurations=4)
+    data = SimulatedCalibrations(design).draw(Batch("machine", 2, np.random.SeedSequence(0)))
+    problem, rng = data.assembled.problem, np.random.default_rng(3)
+    check(problem, problem.retract(data.start, *small_steps(problem, data.start, rng)), rng)
+
+
+def small_steps(problem, state, rng):
+    linear = problem.linearize(state)
+    own = linear.by_own.shape[:2] + linear.by_own.shape[-1:]
+    shape = (state.z.shape[0], problem.unknowns.count)
+    return 0.001 * rng.normal(size=shape), 0.001 * rng.normal(size=own)
+
+
+def test_true_machines_of_a_study_close_at_their_readings(tmp_path):
+    """Eight cables for six freedoms: readings of the nominal model would not close theirs."""
+    camera = Pinhole((1280, 960), np.array([900.0, 900.0, 639.5, 479.5, 0, 0, 0, 0, 0]))
+    design = Design(cables(tmp_path, "pulley"), (camera,), stations=2, configurations=4)
+    data = SimulatedCalibrations(design).draw(Batch("machine", 3, np.random.SeedSequence(1)))
+    joints = data.assembled.problem.data.joints
+    layout = data.capture.machine.layout
+    rows = closure(layout, data.theta[:, None], joints, data.poses)
+    assert np.abs(rows.rows.value).max() < 6 * design.reading_noise
+
+
+def test_configurations_are_those_that_cables_allow(tmp_path):
+    """Turned by 35 degrees at most, and the nominal model takes their readings alike: cables to a
+    platform that is turned by a hundred degrees would cross.
+    """
+    rng = np.random.default_rng(5)
+    nominal = cables(tmp_path, "pulley")
+    for _ in range(3):
+        truth = true_machine(nominal, 1.0, rng)
+        poses, joints = draw_configurations(truth, 40, 0.0, rng)
+        by_nominal = nominal.forward_result(joints).T_base_platform
+        for other in (by_nominal, np.broadcast_to(truth.home(), poses.shape)):
+            turn = np.linalg.norm(pose_difference(poses, other)[:, :3], axis=1)
+            assert np.rad2deg(turn.max()) < 35
