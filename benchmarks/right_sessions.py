@@ -296,8 +296,8 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
 
     from pkmcal import calibrate
     from pkmcal.errors import PkmcalError
-    from pkmcal.identify.row_sums import READING_ROWS
     from pkmcal.identify.noise import noise_shares
+    from pkmcal.identify.row_sums import READING_ROWS
 
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         session = KINDS[kind](Path(temporary) / "session", seed)

@@ -295,7 +295,7 @@ WRONG = {
         "loops at home": r"(platform_yaw: )[^,]+",
         "readings at home": r"(joint: leg3, scale: [^,]+, home: )[^}]+",
         "radii": r'(<visual name="leg3_tube1">(?:(?!radius=).)*radius=")[^"]+',
-        "platform's place": r'(name="leg1" type="prismatic">(?:(?!<axis).)*<axis xyz=")[^ ]+',
+        "platform's place": r"(joint: leg3, scale: )[^,]+",
     },
     "sdf": {
         "joint centres on the base": r'(name="leg2_rod">\s*<pose relative_to="base">)[^ ]+',
@@ -303,7 +303,7 @@ WRONG = {
         "ends of the rods": r'(name="leg1_piston">\s*<pose relative_to="leg1_rod">)[^ ]+',
         "platform's turn": r'(pkmcal:reading joint="leg3" home=")[^"]+',
         "radii": r'(<visual name="leg3_tube1">(?:(?!<radius>).)*<radius>)[^<]+',
-        "platform's place": r'(name="leg1" type="prismatic">(?:(?!<xyz>).)*<xyz>)[^ ]+',
+        "platform's place": r'(pkmcal:reading joint="leg3" home="[^"]+" scale=")[^"]+',
     },
 }
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
+from pkmcal.exporters.from_bodies import bodies_model, is_model
 from pkmcal.files import read_text
 from pkmcal.firmware.hangprinter import hangprinter_model, is_hangprinter
 from pkmcal.firmware.klipper_machines import is_klipper, klipper_model
@@ -159,7 +160,8 @@ def new(
         ``klipper``, ``marlin``, ``repetier``, ``reprap`` or ``smoothie``, for a ``printer`` that
         does not show which it is of.
     from_file :
-        Klipper's printer.cfg of a rotary delta or a winch, a Hangprinter's configuration with
+        MJCF, SDF, or URDF with its file of loops, all with ``tube_radius`` where known; Klipper's
+        printer.cfg of a rotary delta or a winch, a Hangprinter's configuration with
         RepRapFirmware's ``M669 K6``, the calibration log of a Maslow 4, or a file of a hexapod's
         joint centres: LinuxCNC's HAL file with pins of genhexkins, or a CSV table with the columns
         leg, base_x, base_y, base_z, platform_x, platform_y, platform_z and their units. Joint
@@ -292,8 +294,14 @@ def _nominal(
 
 
 def _file_model(path: Path, unit: str | None, dimensions: Mapping[str, float]) -> NominalModel:
-    """Nominal model of a printer's configuration, which has all dimensions, or of centres."""
+    """Nominal model of bodies and joints, of a printer's configuration, or of joint centres."""
     text = read_text(path)
+    if is_model(text):
+        if unit is not None:
+            raise InputError(
+                "a model of bodies is in metres", where="--unit", found=unit, expected="no --unit"
+            )
+        return bodies_model(path, dimensions)
     if is_hangprinter(text):
         whole, model = "a Hangprinter's configuration", partial(hangprinter_model, text, path.name)
     elif is_klipper(path):

@@ -49,9 +49,10 @@ def _dimension(name: str, described: str, usual: str = "") -> Any:
         " repetier, reprap or smoothie.",
     ),
     option(
-        "--from from_file", "FILE", "Klipper's printer.cfg of a rotary delta or a winch,"
-        " RepRapFirmware's configuration of a Hangprinter, or a Maslow 4's calibration log; with"
-        " --leg, a hexapod's joint centres: LinuxCNC's HAL file of genhexkins, or a CSV table.",
+        "--from from_file", "FILE", "MJCF, SDF, or URDF with its file of loops; Klipper's"
+        " printer.cfg of a rotary delta or a winch, RepRapFirmware's configuration of a"
+        " Hangprinter, or a Maslow 4's calibration log; with --leg, a hexapod's joint centres:"
+        " LinuxCNC's HAL file of genhexkins, or a CSV table.",
         Path,
     ),
     option("--unit", "NAME", "Unit of a HAL file's lengths: mm or inch."),

@@ -23,6 +23,9 @@ from pkmcal.geometry.rigid import (
 )
 
 NO_TRANSLATION = np.zeros(3)
+JOINT_BODY = " joint"
+"""End of the names of bodies that readers add where a joint is beside its body's origin."""
+NO_LIMITS = np.full(2, np.nan)
 MOST_CLOSING_STEPS = 30
 LOOPS_CLOSED_STEP = 1e-13
 """Largest step of a converged closure, m or rad."""
@@ -41,6 +44,7 @@ class ReadJoint(NamedTuple):
     axis : (3,) in the body's frame.
     dof : index of its first degree of freedom.
     ref : value at home, m or rad; without meaning for a free joint.
+    limits : (2,) smallest and largest value; NaN for none.
     """
 
     name: str
@@ -48,6 +52,7 @@ class ReadJoint(NamedTuple):
     axis: Array
     dof: int
     ref: float
+    limits: Array = NO_LIMITS
 
 
 class ReadBody(NamedTuple):
@@ -131,7 +136,7 @@ class ReadModel:
         for c in self.couplings:
             off = x[..., c.follower] - c.ratio * x[..., c.leader] - c.offset
             out.append(off[..., None])
-        return np.concatenate(out, axis=-1)
+        return np.concatenate([np.zeros((*x.shape[:-1], 0)), *out], axis=-1)
 
     @property
     def names(self) -> dict[str, int]:

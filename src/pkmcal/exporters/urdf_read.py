@@ -1,108 +1,207 @@
-"""Reader of URDF, as far as :mod:`pkmcal.exporters.urdf` uses it, with its file of loops.
+"""Reader of URDF, with its file of loops.
 
 Links and joints have the meaning of URDF's documentation.
 """
 
 from __future__ import annotations
 
-from xml.etree.ElementTree import Element, fromstring
+from pathlib import Path
+from typing import Annotated, Literal
+from xml.etree.ElementTree import Element
 
 import numpy as np
-import yaml
+from pydantic import Field
 
 from pkmcal.arrays import Array
-from pkmcal.exporters.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
+from pkmcal.errors import InputError
+from pkmcal.exporters.read_model import (
+    NO_LIMITS,
+    ReadBody,
+    ReadCoupling,
+    ReadJoint,
+    ReadLoop,
+    ReadModel,
+)
+from pkmcal.exporters.xml_read import (
+    TUBE_MARK,
+    attribute,
+    limits_of,
+    numbers,
+    refused,
+    unit_axis,
+    vector,
+    xml_root,
+)
+from pkmcal.files import Schema, parse_yaml, validated_document
 from pkmcal.geometry.rigid import from_roll_pitch_yaw, pose
 
 URDF_JOINT_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}
 
 
-def read_urdf(text: str, loops: str) -> ReadModel:
-    """Model of a URDF text and its file of loops."""
-    root, beside = fromstring(text), yaml.safe_load(loops)
-    links = {node.attrib["name"]: node for node in root.findall("link")}
-    joint_above = {_link(node, "child"): node for node in root.findall("joint")}
-    bodies: list[ReadBody] = []
-    numbers: dict[str, int] = {}
-    joints: dict[str, ReadJoint] = {}
+class LoopEntry(Schema):
+    """Two links that coincide, in their origins or as poses."""
 
-    def put(link: str) -> int:
-        """Index of a link's body, added after its parent's if necessary."""
-        if link in numbers:
-            return numbers[link]
-        node = joint_above.get(link)
-        if node is None:  # the root
-            bodies.append(ReadBody(link, 0, np.eye(4), ()))
-        else:
-            parent, own = put(_link(node, "parent")), tuple[ReadJoint, ...]()
-            if node.attrib["type"] != "fixed":
-                axis = _vector(node.find("axis"), "xyz", "1 0 0")
-                name, kind = node.attrib["name"], URDF_JOINT_KINDS[node.attrib["type"]]
-                joints[name] = ReadJoint(name, kind, axis, len(joints), 0.0)
-                own = (joints[name],)
-            bodies.append(ReadBody(link, parent, _origin_pose(node), own))
-        numbers[link] = len(bodies) - 1
-        return numbers[link]
+    name: str
+    frames: tuple[str, str]
+    coincide: Literal["point", "pose"]
 
-    for link in links:
-        put(link)
-    # joints that follow others, and the state at home
-    couplings: list[ReadCoupling] = []
-    for node in root.findall("joint"):
-        if (mimic := node.find("mimic")) is not None:
-            ratio, offset = (float(mimic.attrib[key]) for key in ("multiplier", "offset"))
-            own, leader = joints[node.attrib["name"]], joints[mimic.attrib["joint"]]
-            couplings.append(ReadCoupling(own.dof, leader.dof, ratio, offset))
-    key = np.zeros(len(joints))
-    for name, value in beside["home"].items():
-        key[joints[name].dof] = value
+
+class ReadingEntry(Schema):
+    """Joint with a reading; the joint's value is scale * reading."""
+
+    joint: str
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    home: float
+
+
+class LoopsDocument(Schema):
+    """File of loops; home has the joints' values in a closed state, m and rad."""
+
+    loops: tuple[LoopEntry, ...]
+    readings: tuple[ReadingEntry, ...]
+    home: dict[str, float]
+
+
+def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadModel:
+    """Model of a URDF text and its file of loops.
+
+    loops_name : name of that file in messages. Raises InputError for what is not read.
+    """
+    root = xml_root(text)
+    beside = validated_document(parse_yaml(loops, Path(loops_name)), LoopsDocument)
+    if foreign := [node for node in root.iter() if "}" in node.tag]:
+        raise InputError(
+            "a xacro file is not read", found=foreign[0].tag, expected="the URDF that it expands to"
+        )
+    tree = _Tree(root, loops_name)
+    couplings = _couplings(root, tree)
+    # the state at home
+    key = np.zeros(len(tree.joints))
+    for name, value in beside.home.items():
+        key[tree.joint(name).dof] = value
     for c in couplings:
         key[c.follower] = c.ratio * key[c.leader] + c.offset
-    # named links: each leg's base, and the two ends of each loop
-    legs = [loop["name"] for loop in beside["loops"]]
-    ends = {f"{leg}_base": numbers[f"{leg}_rod"] for leg in legs}
-    ends |= {name: numbers[name] for loop in beside["loops"] for name in loop["frames"]}
-    readings = beside["readings"]
-    radii = {
-        node.attrib["name"]: float(node.findall("geometry/cylinder")[0].attrib["radius"])
-        for node in root.iter("visual")
-        if "name" in node.attrib
-    }
+    # named links: the two ends of each loop, and each leg's base
+    ends = {name: tree.link(name) for loop in beside.loops for name in loop.frames}
+    rods = ((f"{loop.name}_base", f"{loop.name}_rod") for loop in beside.loops)
+    sites = ends | {name: tree.numbers[rod] for name, rod in rods if rod in tree.numbers}
     return ReadModel(
-        bodies=tuple(bodies),
+        bodies=tuple(tree.bodies),
         loops=tuple(
             ReadLoop(
-                loop["coincide"] == "pose",
-                (ends[loop["frames"][0]], ends[loop["frames"][1]]),
+                loop.coincide == "pose",
+                (ends[loop.frames[0]], ends[loop.frames[1]]),
                 (np.eye(4), np.eye(4)),
             )
-            for loop in beside["loops"]
+            for loop in beside.loops
         ),
-        couplings=tuple(couplings),
-        sites={name: (body, np.zeros(3)) for name, body in ends.items()},
-        radii=radii,
-        actuated=np.array([joints[r["joint"]].dof for r in readings], dtype=int),
-        gear=np.array([1 / r["scale"] for r in readings]),
-        ctrl=np.array([r["home"] for r in readings]),
+        couplings=couplings,
+        sites={name: (body, np.zeros(3)) for name, body in sites.items()},
+        radii={
+            name: float(vector(cylinder, "radius", "", 1)[0])
+            for node in root.iter("visual")
+            if TUBE_MARK in (name := node.get("name", ""))
+            and (cylinder := node.find("geometry/cylinder")) is not None
+        },
+        actuated=np.array([tree.joint(r.joint).dof for r in beside.readings], dtype=int),
+        gear=np.array([1 / r.scale for r in beside.readings]),
+        ctrl=np.array([r.home for r in beside.readings]),
         key=key,
     )
 
 
-def _link(joint: Element, which: str) -> str:
-    """Name of a joint's parent or child link."""
-    node = joint.find(which)
-    return "" if node is None else node.attrib["link"]
+class _Tree:
+    """Links as bodies, each added after its parent.
+
+    numbers : index of each link's body. joints : by name.
+    """
+
+    def __init__(self, root: Element, loops_name: str) -> None:
+        self.loops_name = loops_name
+        self.links = {attribute(node, "name"): node for node in root.findall("link")}
+        self.above = {self._end(node, "child"): node for node in root.findall("joint")}
+        self.bodies: list[ReadBody] = []
+        self.numbers: dict[str, int] = {}
+        self.joints: dict[str, ReadJoint] = {}
+        for link in self.links:
+            self._put(link)
+
+    def link(self, name: str) -> int:
+        """Index of the body of a link that the file of loops names."""
+        if name not in self.numbers:
+            raise InputError("there is no such link in the URDF", where=self.loops_name, found=name)
+        return self.numbers[name]
+
+    def joint(self, name: str) -> ReadJoint:
+        """Joint that a mimic or the file of loops names."""
+        if name not in self.joints:
+            raise InputError(
+                "there is no such joint in the URDF", where=self.loops_name, found=name
+            )
+        return self.joints[name]
+
+    def _end(self, joint: Element, which: str) -> str:
+        """Name of a joint's parent or child link."""
+        node = joint.find(which)
+        name = "" if node is None else node.get("link", "")
+        if name not in self.links:
+            raise refused(joint, f"there is no link that is its {which}", name)
+        return name
+
+    def _put(self, link: str, depth: int = 0) -> int:
+        """Index of a link's body, added after its parent's if necessary."""
+        if link in self.numbers:
+            return self.numbers[link]
+        node = self.above.get(link)
+        if depth > len(self.links):
+            raise refused(self.links[link], "a link is above itself, and a URDF is a tree")
+        if node is None:  # the root
+            if self.bodies:
+                raise refused(
+                    self.links[link], "a URDF has one root", f"{self.bodies[0].name} besides"
+                )
+            self.bodies.append(ReadBody(link, 0, np.eye(4), ()))
+        else:
+            parent, own = self._put(self._end(node, "parent"), depth + 1), tuple[ReadJoint, ...]()
+            if node.get("type") != "fixed":
+                own = (_joint(node, len(self.joints)),)
+                self.joints[own[0].name] = own[0]
+            self.bodies.append(ReadBody(link, parent, _origin_pose(node), own))
+        self.numbers[link] = len(self.bodies) - 1
+        return self.numbers[link]
+
+
+def _couplings(root: Element, tree: _Tree) -> tuple[ReadCoupling, ...]:
+    """Joints that follow others."""
+    out: list[ReadCoupling] = []
+    for node in root.findall("joint"):
+        if (mimic := node.find("mimic")) is not None:
+            ratio = float(vector(mimic, "multiplier", "1", 1)[0])
+            offset = float(vector(mimic, "offset", "0", 1)[0])
+            follower, leader = attribute(node, "name"), attribute(mimic, "joint")
+            out.append(
+                ReadCoupling(tree.joint(follower).dof, tree.joint(leader).dof, ratio, offset)
+            )
+    return tuple(out)
+
+
+def _joint(node: Element, dof: int) -> ReadJoint:
+    """Hinge or slide of a joint's element."""
+    kind = URDF_JOINT_KINDS.get(node.get("type", ""))
+    if kind is None:
+        types = ", ".join((*URDF_JOINT_KINDS, "fixed"))
+        raise refused(node, "this type of joint is not read", node.get("type"), types)
+    part, limit = node.find("axis"), node.find("limit")
+    axis = numbers(node, "1 0 0" if part is None else part.get("xyz", "1 0 0"), (3,), "axis")
+    limits = NO_LIMITS
+    if limit is not None:
+        limits = limits_of(limit, limit.get("lower"), limit.get("upper"))
+    return ReadJoint(attribute(node, "name"), kind, unit_axis(node, axis), dof, 0.0, limits)
 
 
 def _origin_pose(node: Element) -> Array:
     """Pose (4, 4) of a joint's origin."""
     origin = node.find("origin")
-    return pose(
-        from_roll_pitch_yaw(_vector(origin, "rpy", "0 0 0")), _vector(origin, "xyz", "0 0 0")
-    )
-
-
-def _vector(node: Element | None, key: str, default: str) -> Array:
-    """Numbers of an attribute, or of the default."""
-    text = default if node is None else node.get(key, default)
-    return np.array([float(v) for v in text.split()])
+    if origin is None:
+        return np.eye(4)
+    return pose(from_roll_pitch_yaw(vector(origin, "rpy", "0 0 0")), vector(origin, "xyz", "0 0 0"))

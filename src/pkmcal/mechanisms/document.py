@@ -111,6 +111,43 @@ MOTION_DIRECTIONS: dict[str, Array] = {
 among the six."""
 
 
+def _check_turn(angle: float) -> float:
+    """Validate an angle: a number beyond a turn was written in degrees."""
+    if abs(angle) > 2 * np.pi:
+        raise ValueError(
+            "should be at most a turn, such as 15 deg; without a unit it is in radians"
+        )
+    return angle
+
+
+class PolarCentre(Schema):
+    """Joint centre about the z axis of its frame, with angles from x towards y:
+    ``center: {radius: 300 mm, angle: 15 deg, z: 0}``.
+    """
+
+    radius: Annotated[
+        Metres, Field(ge=0, description="the distance from the z axis, such as 300 mm")
+    ]
+    angle: Annotated[
+        Radians,
+        AfterValidator(_check_turn),
+        Field(description="the angle from x towards y, such as 15 deg"),
+    ]
+    z: Annotated[Metres, Field(description="the height, such as 12.5 mm")] = 0.0
+
+    @property
+    def point(self) -> tuple[float, float, float]:
+        """[x, y, z], m."""
+        x, y = self.radius * np.cos(self.angle), self.radius * np.sin(self.angle)
+        return float(x), float(y), self.z
+
+
+class _WithPolarCentre(Schema):
+    """A carrier's polar centre, with its key for the messages."""
+
+    center: PolarCentre
+
+
 class _OneOfTheCarriers:
     """Annotation of a field that has the schema of one of the carriers, selected by ``joint``.
 
@@ -128,6 +165,9 @@ class _OneOfTheCarriers:
         """Validated field, from a file's content or from another machine's document."""
         if isinstance(value, Schema):
             return value
+        if isinstance(value, dict) and isinstance(value.get("center"), dict):
+            text = json.dumps({"center": value["center"]})
+            value = {**value, "center": _WithPolarCentre.model_validate_json(text).center.point}
         return self.adapter().validate_json(
             json.dumps(value)
         )  # as :func:`pkmcal.files.validated_document`
@@ -138,7 +178,8 @@ class _OneOfTheCarriers:
     def __get_pydantic_json_schema__(
         self, _: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        return handler(self.adapter().core_schema)
+        adapters = (self.adapter(), TypeAdapter(_WithPolarCentre))
+        return {"anyOf": [handler(adapter.core_schema) for adapter in adapters]}
 
 
 @cache

@@ -48,7 +48,8 @@ class NominalLeg:
 
     base, rod : their entries in the file. start : A (3,) at home, base frame. platform : B (3,),
     platform frame. least : shortest length; None for that at home. axis : (3,) of its universal
-    joint on the platform; None for a spherical one.
+    joint on the platform; None for a spherical one. held : the platform's entry, where it is neither
+    of these. scale : of the reading; 1 if empty.
     """
 
     base: str
@@ -57,6 +58,8 @@ class NominalLeg:
     platform: Array
     least: float | None = None
     axis: Array | None = None
+    held: str = ""
+    scale: str = ""
 
     __repr__ = short_repr
 
@@ -123,7 +126,8 @@ class NominalModel:
     heading : paragraphs of the file's first comment. numbers : lines of a comment for each number
     that it is made of. home : (3,) position of the platform, m, without rotation. tube_radius : of
     every leg's cylinder, None for legs without. assumed : names of numbers that were not given.
-    sigma : standard deviation of the numbers, m; None for that of a ruler.
+    sigma : standard deviation of the numbers, m; None for that of a ruler. home_entry : the
+    file's home; ``home`` to the micrometre by default.
     """
 
     name: str
@@ -134,6 +138,7 @@ class NominalModel:
     home: Array
     tube_radius: float | None = None
     assumed: tuple[str, ...] = ()
+    home_entry: str = ""
     sigma: float | None = None
 
     __repr__ = short_repr
@@ -143,17 +148,20 @@ class NominalModel:
         lines = [line for part in self.heading for line in textwrap.wrap(part, 96)]
         for first, *rest in self.numbers:
             lines += ["", first, *(f"  {line}" for line in rest)]
+        home = self.home_entry or f"{{position: {_numbers(self.home)}}}"
+        frames = "# Base joints in the base frame, platform joints in the platform frame"
+        same = ", which has the same\n# directions at home; z is up. "
+        frames += ".\n# " if self.home_entry else same
         comment = "\n".join(f"# {line}".rstrip() for line in lines)
         sigma = self.sigma
         if sigma is None:
             sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
         return (
             f"{comment}\nname: {self.name}\nmotion: {self.motion}\n\n"
-            "# Base joints in the base frame, platform joints in the platform frame, which has the"
-            " same\n# directions at home; z is up. Replace any centre by a better one.\nlegs:\n"
+            f"{frames}Replace any centre by a better one.\nlegs:\n"
             + "".join(map(self._leg_text, self.legs))
             + f"\n# The platform frame's origin in the middle of the workspace.\n"
-            f"home: {{position: {_numbers(self.home)}}}\n\n"
+            f"home: {home}\n\n"
             "# Standard deviations of these numbers: how well they were measured, and made.\n"
             f"tolerance: {{center: {millimetres(sigma)}, offset: {millimetres(sigma)}}}\n"
         )
@@ -184,8 +192,9 @@ class NominalModel:
 
     def _leg_text(self, leg: NominalLeg) -> str:
         """Entry of a leg."""
-        platform = _joint(leg.platform, leg.axis)
+        platform = leg.held or _joint(leg.platform, leg.axis)
         text = f"  - base: {leg.base}\n    platform: {platform}\n    length: {leg.rod}\n"
+        text += f"    scale: {leg.scale}\n" if leg.scale else ""
         if self.tube_radius is None:
             return text
         length = float(np.linalg.norm(leg.platform + self.home - leg.start))
