@@ -48,8 +48,8 @@ class NominalLeg:
 
     base, rod : their entries in the file. start : A (3,) at home, base frame. platform : B (3,),
     platform frame. least : shortest length; None for that at home. axis : (3,) of its universal
-    joint on the platform; None for a spherical one. held : the platform's entry, where it is neither
-    of these. scale : of the reading; 1 if empty.
+    joint on the platform; None for a spherical one. held : the platform's entry, where it is
+    neither of these. scale : of the reading; 1 if empty.
     """
 
     base: str
