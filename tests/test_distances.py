@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -187,6 +188,21 @@ def test_what_is_exported_has_the_bed_at_zero_and_the_size_right(kit, true):
     z = flat(true, pasted(text))
     assert np.std(z) < 0.015
     assert abs(np.mean(z)) < 0.015
+
+
+@pytest.mark.parametrize(("error", "code"), [(0.06, "links.scatter"), (0.3, "links.misfit")])
+def test_distances_that_disagree_with_the_machine(kit, tmp_path, error, code):
+    """Further errors (mm) of distances whose stated noise is 0.03 mm."""
+    shutil.copytree(kit, tmp_path / "kit")
+    table = tmp_path / "kit/distances.csv"
+    head, *rows = table.read_text().splitlines()
+    rng = np.random.default_rng(2)
+    values = [row.rsplit(",", 1) for row in rows]
+    wrong = [f"{ends},{float(value) + error * rng.normal():.3f}" for ends, value in values]
+    table.write_text("\n".join([head, *wrong]) + "\n")
+    verdict = calibrate_session(tmp_path / "kit").verdict
+    assert [one.code for one in verdict.of("links")] == [code]
+    assert verdict.usable == (code == "links.scatter")
 
 
 def test_held_out_configurations_take_their_distances_with_them(measured):

@@ -10,8 +10,10 @@ from pkmcal.arrays import Integers
 from pkmcal.identify.bed import bed_by_parameters
 from pkmcal.identify.confirmation import RejectedUnit, rejected_units, rejections_of
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.identify.tool import platform_by_parameters, platform_sigma
 from pkmcal.identify.unidentified import Identification
+from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, VERDICT
 from pkmcal.measurements import LinkSet, Measurements
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome.finding import Finding, doubtful, wrong
@@ -40,7 +42,7 @@ def rejection_findings(
     """
     units = rejected_units(measurements, estimate)
     if at_minimum:
-        yield from _unchecked_links(measurements, estimate)
+        yield from _links(measurements, estimate)
     if not units:
         return
     edges = measurements.edges
@@ -88,14 +90,21 @@ def rejection_findings(
         )
 
 
-def _unchecked_links(measurements: Measurements, estimate: Estimate) -> Iterator[Finding]:
-    """Warning about links that alone determine something, so that an outlier leaves hardly any
-    residual.
+def _links(measurements: Measurements, estimate: Estimate) -> Iterator[Finding]:
+    """Findings on links that the model does not explain, as of poses; and a warning where they
+    alone determine something, so that an outlier leaves hardly any residual.
     """
     s = estimate.statistics
-    if measurements.n_links and s.dof_links < LEAST_CHECKED_SHARE * s.n_links:
-        labels = [measurement_kinds()[links.kind].label for links in measurements.links]
+    if not measurements.n_links:
+        return
+    labels = [measurement_kinds()[links.kind].label for links in measurements.links]
+    if s.dof_links < LEAST_CHECKED_SHARE * s.n_links:
         yield doubtful("links.unchecked", listed(labels), names=labels)
+    least = max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(Search.POSE_NOISE, s.dof_links))
+    if s.link_scale > VERDICT.too_noisy:
+        yield wrong("links.misfit", listed(labels), names=labels, scale=s.link_scale)
+    elif s.link_scale > least:
+        yield doubtful("links.scatter", listed(labels), names=labels, scale=s.link_scale)
 
 
 def unused_configurations(

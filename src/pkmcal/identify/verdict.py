@@ -183,6 +183,10 @@ def _headline(estimate: Estimate, joints: Array | None) -> str:
         if not np.isfinite(before):  # the nominal model takes none of the poses
             changes.append(f"{amount(after, unit)} (1σ)")
             continue
+        if before < after:  # the data do not distinguish the two machines
+            change = f"{amount(after, unit)} (1σ; the nominal model is {amount(before, unit)} off)"
+            changes.append(change)
+            continue
         times = float(f"{before / after:.2g}")
         gain = f" ({times:g} times)" if times > 1 else ""
         changes.append(f"{amount(before, unit)} → {amount(after, unit)}{'' if changes else gain}")
