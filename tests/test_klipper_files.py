@@ -371,9 +371,8 @@ def test_distances_that_klipper_saved(tmp_path):
             lines.append(f"#*# distance{k}_pos{n} = " + ",".join(f"{s:.3f}" for s in steps))
     text = printers.printer_cfg(SAYS, readings) + "\n".join(lines) + "\n"
     printer = read_printer(files(tmp_path, printer_cfg=text))
-    np.testing.assert_array_equal(printer.distances.values, 70.0 + np.arange(12))
-    np.testing.assert_allclose(printer.distances.first, carriages[:, 0], atol=1e-4)
-    np.testing.assert_allclose(printer.distances.second, carriages[:, 1], atol=1e-4)
+    np.testing.assert_array_equal(printer.part.distance, 70.0 + np.arange(12))
+    np.testing.assert_allclose(printer.part.carriages[printer.part.between], carriages, atol=1e-4)
     assert len(printer.touches.heights) == 9
     broken = text.replace("distance3_pos2", "distance3_pos3")
     with pytest.raises(InputError, match="distance3_pos2"):

@@ -10,7 +10,9 @@ spool's radius R in the origin, the spool turns by ``2 U / k2 (sqrt(R^2 + k2 pos
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from fractions import Fraction
+from pathlib import Path
 from typing import ClassVar, final
 
 import numpy as np
@@ -26,6 +28,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import scales
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.starter.nominal import NominalLeg, NominalModel, millimetres
+from pkmcal.starter.sources import StarterSource
 
 HANGPRINTER_FILE = "hangprinter.g"
 ANCHOR_LETTERS = "ABCDIJ"
@@ -193,9 +196,24 @@ def _spools(machine: Machine) -> dict[str, Array]:
 # Reading
 
 
-def is_hangprinter(text: str) -> bool:
-    """Whether a configuration makes RepRapFirmware a Hangprinter."""
-    return _K6.search(text) is not None
+@final
+class HangprinterConfiguration(StarterSource):
+    """RepRapFirmware's configuration of a Hangprinter."""
+
+    title: ClassVar = "a Hangprinter's configuration"
+    recognised: ClassVar = "RepRapFirmware's line 'M669 K6' of a Hangprinter"
+
+    def claims(self, text: str, path: Path) -> bool:
+        """Whether a configuration makes RepRapFirmware a Hangprinter."""
+        del path
+        return _K6.search(text) is not None
+
+    def read(
+        self, text: str, path: Path, unit: str | None, given: Mapping[str, float]
+    ) -> NominalModel:
+        """Nominal model. Raises InputError for a configuration without the anchors."""
+        del unit, given
+        return _model(text, path.name)
 
 
 def hangprinter_words(text: str, label: str) -> dict[str, Array]:
@@ -256,7 +274,7 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
     return out
 
 
-def hangprinter_model(text: str, label: str) -> NominalModel:
+def _model(text: str, label: str) -> NominalModel:
     """Nominal model of a Hangprinter by its configuration: readings are the motors' turns if M666
     gives the spools, and otherwise the lines' positions. Raises InputError.
     """

@@ -34,7 +34,7 @@ from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     LARGEST_PRINTER_VALUE,
     NUMBER,
-    PartDistances,
+    PrintedPart,
     Printer,
     Touches,
     means_by_position,
@@ -81,7 +81,7 @@ def saved_touches(config: KlipperConfig, ends: Array, mm_a_step: Array | None) -
 
 def saved_distances(
     config: KlipperConfig, ends: Array, mm_a_step: Array | None
-) -> PartDistances | None:
+) -> PrintedPart | None:
     """Distances that DELTA_ANALYZE saved; arguments as for `saved_touches`."""
     names = _numbered(config, "distance")
     if not names:
@@ -90,7 +90,9 @@ def saved_distances(
     first, second = (
         _stable(config, [f"{name}_pos{end}" for name in names], ends, mm_a_step) for end in (1, 2)
     )
-    return PartDistances(first, second, np.array(values), f"{config.label}, [delta_calibrate]")
+    return PrintedPart.of_pairs(
+        first, second, np.array(values), f"{config.label}, [delta_calibrate]"
+    )
 
 
 def _numbered(config: KlipperConfig, kind: str) -> list[str]:
@@ -252,7 +254,7 @@ def _faulty(config: KlipperConfig, grid: Array) -> np.ndarray:
     return inside
 
 
-def analyzed_distances(text: str, label: str, printer: Printer) -> PartDistances | None:
+def analyzed_distances(text: str, label: str, printer: Printer) -> PrintedPart | None:
     """Distances of DELTA_ANALYZE in a console's output or in klippy.log; None without any.
 
     Raises InputError for an incomplete set of measurements.
@@ -273,9 +275,9 @@ def analyzed_distances(text: str, label: str, printer: Printer) -> PartDistances
         raise InputError(
             "the measurements of the calibration object are not complete",
             where=label,
-            found=f"{name} with {len(words.get(name, ()))} values",
+            found=f"{name}={','.join(f'{value:g}' for value in words.get(name, ()))}",
             expected=", ".join(f"{one} with {size}" for one, size in ANALYZED.items())
-            + " values, and SCALE with one if the object was scaled",
+            + " values, and SCALE between 0.01 and 100 if the object was scaled",
         )
     angles = np.deg2rad(OBJECT_ANGLES)
     out = scale[0] * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
@@ -302,4 +304,4 @@ def analyzed_distances(text: str, label: str, printer: Printer) -> PartDistances
             expected="distances over the pillars' outer edges, in mm",
         )
     ends = [reachable_carriages(points, printer, label) for points in (first, second)]
-    return PartDistances(ends[0], ends[1], values, label)
+    return PrintedPart.of_pairs(ends[0], ends[1], values, label)
