@@ -20,6 +20,7 @@ from pkmcal.starter import check_new_folder, session_texts, write_texts
 from pkmcal.starter.families import FAMILIES, family_model
 from pkmcal.starter.nominal import NominalModel, option_of
 from pkmcal.starter.sources import SessionTexts, read_source
+from pkmcal.wording import listed
 
 SESSION_FILE_DESCRIPTIONS = {
     "session.yaml": "begin here: what to do, step by step",
@@ -211,11 +212,12 @@ def new(
         what = "both" if board and legs else "board" if board else "legs" if legs else None
         nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
         if isinstance(nominal, dict):
-            if what is not None or places is not None:
+            others = {"--legs": legs, "--board": board, "--places": places}
+            if extra := [name for name, given in others.items() if given]:
                 raise InputError(
                     "the file has all measurements of its session",
                     where="--from",
-                    found="--legs, --board or --places besides",
+                    found=f"{listed(extra)} besides",
                     expected="--from FILE alone",
                 )
             return NewResult(nominal, complete=True)

@@ -40,11 +40,13 @@ LINE_ROUNDING = 2e-7
 """Tolerance of a line's position, m: numbers are written to nine digits."""
 SPOOL_LETTERS = "RUOLH"
 """Letters of M666 with a value for each axis."""
+SHORTEST_LINE = 50.0
+"""Bound below which the longest line, mm, shows anchors in other units: metres or inches."""
 ANCHOR_SIGMA = 0.01
 """Standard deviation of an anchor that was measured with a tape, m."""
 _K6 = re.compile(r"^[ \t]*M669[^;\n]*?[ \t]K6(?![0-9])", re.MULTILINE)
 _COMMAND = re.compile(r"^[ \t]*(M669|M666)([^;\n]*)", re.MULTILINE)
-_WORD = re.compile(r"([A-Z])([-+.0-9:eE]+)")
+_WORD = re.compile(r"([A-Z])([-+.,0-9:eE]+)")
 
 
 @final
@@ -281,6 +283,13 @@ def _model(text: str, label: str) -> NominalModel:
     words = hangprinter_words(text, label)
     anchors = 1e-3 * words["anchors"]
     lengths = np.linalg.norm(anchors, axis=1)
+    if 1e3 * lengths.max() < SHORTEST_LINE:
+        raise InputError(
+            "the anchors are too near to the origin for a Hangprinter",
+            where=f"{label}, M669",
+            found=f"{1e3 * lengths.max():.4g} mm at most",
+            expected=f"{SHORTEST_LINE:g} mm or more: M669's coordinates are in mm",
+        )
     reads = "the lines' positions: their lengths less those in the origin"
     if spools := "R" in words:
         reads = "the motors' turns from the origin, positive where the line becomes longer"
