@@ -228,15 +228,15 @@ def test_a_session_of_a_mesh(tmp_path):
 
 MESH = mesh_lines(5, 60, round_bed=False)
 WRONG_MESHES = {
-    CFG + MESH: "without the section",
-    "[bed_mesh]\nmesh_min: 0,0\nzero_reference_position: 0,0\n" + CFG + MESH: "relative to one",
-    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("x_count = 5", "x_count = 6"): "cannot be",
-    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("0.1", "nan", 1): "cannot be",
-    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("min_x", "min_w"): "missing: min_x",
-    "[bed_mesh]\nfaulty_region_1_min: a,b\nfaulty_region_1_max: 1,2\n" + CFG + MESH: "this region",
+    CFG + MESH: "printer.cfg, [bed_mesh default]",
+    "[bed_mesh]\nmesh_min: 0,0\nzero_reference_position: 0,0\n" + CFG + MESH: "position: 0,0",
+    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("x_count = 5", "x_count = 6"): "x_count 6, ",
+    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("0.1", "nan", 1): "a height 'nan",
+    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("min_x", "min_w"): "min_x: a number",
+    "[bed_mesh]\nfaulty_region_1_min: a,b\nfaulty_region_1_max: 1,2\n" + CFG + MESH: "a,b to 1,2",
     "[bed_mesh]\nmesh_min: 0,0\n" + CFG + "".join(
         mesh_lines(5, 60, name=name, round_bed=False) for name in ("a", "b")
-    ): "several meshes",
+    ): "[bed_mesh a] and [bed_mesh b]",
 }  # fmt: skip
 
 
@@ -245,7 +245,8 @@ def test_meshes_that_cannot_be_used(text, tmp_path):
     path = files(tmp_path, printer_cfg=text)
     with pytest.raises(InputError) as caught:
         read_measured(path, read_printer(path), own=True)
-    assert WRONG_MESHES[text] in str(caught.value)
+    error = caught.value
+    assert WRONG_MESHES[text] in f"{error.where} {error.found} {error.expected}"
 
 
 # ------------------------------------------------------------------ the console

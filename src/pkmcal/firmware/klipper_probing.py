@@ -46,6 +46,8 @@ from pkmcal.firmware.klipper_config import KlipperConfig, Sections
 
 MOST_CARRIAGE_STEPS = 1e9
 """Bound on steps from an end switch; more would be kilometres of carriage travel."""
+LARGEST_MESH_HEIGHT = 1e3
+"""Bound on the heights of a mesh, mm."""
 MOST_MESH_POINTS = 200
 """Bound on the points of a mesh's row or column."""
 KLIPPER_STEPPERS = ("a", "b", "c")
@@ -215,22 +217,33 @@ def _mesh_heights(entries: Sections, section: str, where: str) -> Array:
     """Heights (rows along y, columns along x) of a mesh, mm."""
     text = entries[section].get("points", ("", where))[0]
     rows = [line.split(",") for line in text.splitlines() if line.strip()]
-    try:
-        z = np.array([[float(word) for word in row] for row in rows])
-    except ValueError:  # words that are no numbers, or rows of different lengths
-        z = np.zeros((0, 0))
+    heights = [[_height(word) for word in row] for row in rows]
+    wrong = next(
+        (word for row in rows for word in row if not abs(_height(word)) < LARGEST_MESH_HEIGHT), None
+    )
     sizes = [entries[section].get(f"{c}_count", ("", ""))[0] for c in "xy"]
-    inside = z.ndim == 2 and all(2 <= n <= MOST_MESH_POINTS for n in z.shape)
-    if not inside or [str(n) for n in z.T.shape] != sizes or not (np.abs(z) < 1e3).all():
+    z = np.array(heights) if len({len(row) for row in rows}) == 1 else np.zeros((0, 0))
+    inside = all(2 <= n <= MOST_MESH_POINTS for n in z.shape)
+    if wrong is not None or not inside or [str(n) for n in z.T.shape] != sizes:
         raise InputError(
             "the mesh cannot be read",
             where=where,
-            found=f"{len(rows)} rows of points, x_count {sizes[0] or 'missing'}, y_count"
+            found=f"a height {quoted(wrong.strip())}"
+            if wrong is not None
+            else f"{len(rows)} rows of points, x_count {sizes[0] or 'missing'}, y_count"
             f" {sizes[1] or 'missing'}",
-            expected=f"y_count rows of x_count heights in mm, at most {MOST_MESH_POINTS}, as"
-            " SAVE_CONFIG wrote them",
+            expected=f"y_count rows of x_count heights below {LARGEST_MESH_HEIGHT:g} mm, at most"
+            f" {MOST_MESH_POINTS}, as SAVE_CONFIG wrote them",
         )
     return z
+
+
+def _height(word: str) -> float:
+    """Number of a text; NaN for another text."""
+    try:
+        return float(word)
+    except ValueError:
+        return np.nan
 
 
 def _faulty(config: KlipperConfig, grid: Array) -> np.ndarray:
