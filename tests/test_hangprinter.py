@@ -115,6 +115,20 @@ def test_configurations_without_what_is_needed(tmp_path, text):
         machine_of(text, tmp_path)
 
 
+METRES = "M669 K6 A0:-1.61:-0.13 B1.29:1.13:-0.15 C-1.41:0.7:-0.12 D0:0:1.9\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [(CONFIG.replace("R75.1:", "R75,1:"), "'75,1:"), (METRES, "1.9 mm")],
+    ids=["decimal comma", "metres"],
+)
+def test_the_wrong_value_is_named(tmp_path, text, found):
+    with pytest.raises(InputError) as refused:
+        machine_of(text, tmp_path)
+    assert str(refused.value.found).startswith(found)
+
+
 @pytest.mark.parametrize("name", ["linear-delta", "gough-stewart", "four-belt"])
 def test_other_machines_are_no_hangprinters(name):
     with pytest.raises(InputError):

@@ -228,15 +228,15 @@ def test_a_session_of_a_mesh(tmp_path):
 
 MESH = mesh_lines(5, 60, round_bed=False)
 WRONG_MESHES = {
-    CFG + MESH: "without the section",
-    "[bed_mesh]\nmesh_min: 0,0\nzero_reference_position: 0,0\n" + CFG + MESH: "relative to one",
-    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("x_count = 5", "x_count = 6"): "cannot be",
-    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("0.1", "nan", 1): "cannot be",
-    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("min_x", "min_w"): "missing: min_x",
-    "[bed_mesh]\nfaulty_region_1_min: a,b\nfaulty_region_1_max: 1,2\n" + CFG + MESH: "this region",
+    CFG + MESH: "printer.cfg, [bed_mesh default]",
+    "[bed_mesh]\nmesh_min: 0,0\nzero_reference_position: 0,0\n" + CFG + MESH: "position: 0,0",
+    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("x_count = 5", "x_count = 6"): "x_count 6, ",
+    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("0.1", "nan", 1): "a height 'nan",
+    "[bed_mesh]\nmesh_min: 0,0\n" + CFG + MESH.replace("min_x", "min_w"): "min_x: a number",
+    "[bed_mesh]\nfaulty_region_1_min: a,b\nfaulty_region_1_max: 1,2\n" + CFG + MESH: "a,b to 1,2",
     "[bed_mesh]\nmesh_min: 0,0\n" + CFG + "".join(
         mesh_lines(5, 60, name=name, round_bed=False) for name in ("a", "b")
-    ): "several meshes",
+    ): "[bed_mesh a] and [bed_mesh b]",
 }  # fmt: skip
 
 
@@ -245,7 +245,8 @@ def test_meshes_that_cannot_be_used(text, tmp_path):
     path = files(tmp_path, printer_cfg=text)
     with pytest.raises(InputError) as caught:
         read_measured(path, read_printer(path), own=True)
-    assert WRONG_MESHES[text] in str(caught.value)
+    error = caught.value
+    assert WRONG_MESHES[text] in f"{error.where} {error.found} {error.expected}"
 
 
 # ------------------------------------------------------------------ the console
@@ -371,9 +372,8 @@ def test_distances_that_klipper_saved(tmp_path):
             lines.append(f"#*# distance{k}_pos{n} = " + ",".join(f"{s:.3f}" for s in steps))
     text = printers.printer_cfg(SAYS, readings) + "\n".join(lines) + "\n"
     printer = read_printer(files(tmp_path, printer_cfg=text))
-    np.testing.assert_array_equal(printer.distances.values, 70.0 + np.arange(12))
-    np.testing.assert_allclose(printer.distances.first, carriages[:, 0], atol=1e-4)
-    np.testing.assert_allclose(printer.distances.second, carriages[:, 1], atol=1e-4)
+    np.testing.assert_array_equal(printer.part.distance, 70.0 + np.arange(12))
+    np.testing.assert_allclose(printer.part.carriages[printer.part.between], carriages, atol=1e-4)
     assert len(printer.touches.heights) == 9
     broken = text.replace("distance3_pos2", "distance3_pos3")
     with pytest.raises(InputError, match="distance3_pos2"):

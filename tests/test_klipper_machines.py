@@ -130,8 +130,10 @@ def test_machines_that_cannot_be_described(text, tmp_path):
 @pytest.mark.parametrize("given", [{"leg": 0.3}, {"unit": "mm"}])
 def test_a_configuration_has_all_dimensions(given, tmp_path):
     (tmp_path / "printer.cfg").write_text(ROTARY)
-    with pytest.raises(InputError, match="has all dimensions"):
+    with pytest.raises(InputError) as refused:
         pkmcal.new(from_file=tmp_path / "printer.cfg", **given)
+    assert refused.value.where == "--from"
+    assert refused.value.found == "--" + next(iter(given))
 
 
 def test_a_printers_option_names_the_other(tmp_path):

@@ -246,8 +246,18 @@ def test_new_and_empty_folders_and_results_are_fine(tmp_path, folder):
 
 
 def test_nothing_there(tmp_path):
-    with pytest.raises(InputError, match="there is no calibration here"):
+    with pytest.raises(InputError) as refused:
         load(tmp_path)
+    assert refused.value.where == str(tmp_path)
+    assert refused.value.next_step is None
+
+
+def test_a_session_names_its_calibration(tmp_path):
+    (tmp_path / "calibration").mkdir()
+    (tmp_path / "calibration" / "calibration.json").write_text("{}")
+    with pytest.raises(InputError) as refused:
+        load(tmp_path)
+    assert str(tmp_path / "calibration") in refused.value.next_step
 
 
 @pytest.mark.parametrize(

@@ -5,17 +5,12 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
-from pkmcal.exporters.from_bodies import bodies_model, is_model
-from pkmcal.files import read_text
-from pkmcal.firmware.hangprinter import hangprinter_model, is_hangprinter
-from pkmcal.firmware.klipper_machines import is_klipper, klipper_model
-from pkmcal.firmware.maslow import is_maslow_log, maslow_session_texts
 from pkmcal.firmware.session import printer_session_texts
 from pkmcal.mechanisms import catalogue
 from pkmcal.outcome import Outcome, Verdict
@@ -23,8 +18,9 @@ from pkmcal.outcome.finding import note
 from pkmcal.ranges import check_number
 from pkmcal.starter import check_new_folder, session_texts, write_texts
 from pkmcal.starter.families import FAMILIES, family_model
-from pkmcal.starter.joint_centres import centres_model
 from pkmcal.starter.nominal import NominalModel, option_of
+from pkmcal.starter.sources import SessionTexts, read_source
+from pkmcal.wording import listed
 
 SESSION_FILE_DESCRIPTIONS = {
     "session.yaml": "begin here: what to do, step by step",
@@ -215,16 +211,17 @@ def new(
         )
     if printer is None and probed is None and part is None:
         what = "both" if board and legs else "board" if board else "legs" if legs else None
-        if from_file is not None and is_maslow_log(text := read_text(Path(from_file))):
-            if extra := _besides(machine, unit, dimensions):
+        nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
+        if isinstance(nominal, dict):
+            others = {"--legs": legs, "--board": board, "--places": places}
+            if extra := [name for name, given in others.items() if given]:
                 raise InputError(
-                    "a Maslow's log is a whole session",
+                    "the file has all measurements of its session",
                     where="--from",
-                    found=f"{extra} besides",
+                    found=f"{listed(extra)} besides",
                     expected="--from FILE alone",
                 )
-            return NewResult(maslow_session_texts(text, Path(from_file).name), complete=True)
-        nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
+            return NewResult(nominal, complete=True)
         return NewResult(
             session_texts(nominal, what, places or 1),
             assumed=nominal.assumed if isinstance(nominal, NominalModel) else (),
@@ -258,20 +255,13 @@ def new(
     return NewResult(texts, of_printer=True, complete=not board)
 
 
-def _besides(machine: Path | str | None, unit: str | None, dimensions: Mapping[str, float]) -> str:
-    """Options that were given besides a file that needs none of them; empty without any."""
-    given = {"--machine": machine, "--unit": unit}
-    names = [name for name, value in given.items() if value is not None]
-    return ", ".join([*names, *(option_of(name) for name in dimensions)])
-
-
 def _nominal(
     machine: str | None,
     from_file: Path | str | None,
     unit: str | None,
     dimensions: Mapping[str, float],
-) -> NominalModel | str | None:
-    """Nominal model of joint centres or of a family's dimensions; otherwise ``machine``."""
+) -> NominalModel | SessionTexts | str | None:
+    """Nominal model or session of a file, or model of a family's dimensions; else ``machine``."""
     if from_file is not None:
         if machine is not None:
             raise InputError(
@@ -280,7 +270,7 @@ def _nominal(
                 found="--machine besides",
                 expected="one of them",
             )
-        return _file_model(Path(from_file), unit, dimensions)
+        return read_source(Path(from_file), unit, dimensions)
     if unit is not None:
         raise InputError(
             "a unit is named for a file of joint centres",
@@ -291,28 +281,3 @@ def _nominal(
     if dimensions or machine in FAMILIES.keys() - catalogue().keys():
         return family_model(machine, dimensions)
     return machine
-
-
-def _file_model(path: Path, unit: str | None, dimensions: Mapping[str, float]) -> NominalModel:
-    """Nominal model of bodies and joints, of a printer's configuration, or of joint centres."""
-    text = read_text(path)
-    if is_model(text):
-        if unit is not None:
-            raise InputError(
-                "a model of bodies is in metres", where="--unit", found=unit, expected="no --unit"
-            )
-        return bodies_model(path, dimensions)
-    if is_hangprinter(text):
-        whole, model = "a Hangprinter's configuration", partial(hangprinter_model, text, path.name)
-    elif is_klipper(path):
-        whole, model = "Klipper's configuration", partial(klipper_model, path)
-    else:
-        return centres_model(path, unit, dimensions)
-    if extra := _besides(None, unit, dimensions):
-        raise InputError(
-            f"{whole} has all dimensions",
-            where="--from",
-            found=f"{extra} besides",
-            expected="--from FILE alone",
-        )
-    return model()

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
 from pkmcal.arrays import Array, Booleans, short_repr
-from pkmcal.calibration.file_names import CALIBRATION_DOCUMENT_FILE
+from pkmcal.calibration.file_names import CALIBRATION_DOCUMENT_FILE, CALIBRATION_FOLDER
 from pkmcal.calibration.results import (
     CALIBRATION_FORMAT,
     EDGE_COLUMNS,
@@ -467,10 +467,14 @@ def _read(source: Path) -> Document:
     """Document of a calibration; raises InputError if there is none or its version is unknown."""
     path = source / CALIBRATION_DOCUMENT_FILE if source.is_dir() else source
     if not path.is_file():
+        inside = source / CALIBRATION_FOLDER  # of a session
         raise InputError(
             "there is no calibration here",
             where=str(source),
             expected=f"a folder that pkmcal calibrate wrote, or its {CALIBRATION_DOCUMENT_FILE}",
+            next_step=f"Name {inside}, the calibration of this session"
+            if (inside / CALIBRATION_DOCUMENT_FILE).is_file()
+            else None,
         )
     document = read_json(path, label=str(path))
     value = document.data.get(FORMAT_KEY)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar, final
 
 import numpy as np
 
@@ -25,7 +26,8 @@ from pkmcal.exporters.xml_read import LARGEST_MODEL_FILE, label_of, xml_root
 from pkmcal.files import read_text
 from pkmcal.geometry.rigid import pose_difference, rotation_vector
 from pkmcal.mechanisms import Machine
-from pkmcal.starter.nominal import NominalModel, option_of
+from pkmcal.starter.nominal import NominalModel
+from pkmcal.starter.sources import StarterSource
 from pkmcal.wording import listed
 
 LOOPS_ENDING = ".loops.yaml"
@@ -51,29 +53,37 @@ MOTIONS = {
 """Motion by the slides and the number of hinges between base and platform."""
 
 
-def is_model(text: str) -> bool:
-    """Whether a text is XML."""
-    return text.lstrip().startswith("<")
+@final
+class BodiesModel(StarterSource):
+    """MJCF, SDF, or URDF with its file of loops."""
 
+    title: ClassVar = "a model of bodies"
+    recognised: ClassVar = "the XML of MJCF, SDF or URDF"
+    options: ClassVar = ("tube_radius",)
 
-def bodies_model(path: Path, given: Mapping[str, float]) -> NominalModel:
-    """Nominal model of MJCF, of SDF, or of URDF with its file of loops.
+    def claims(self, text: str, path: Path) -> bool:
+        """Whether a text is XML."""
+        del path
+        return text.lstrip().startswith("<")
 
-    given : dimensions, m; only ``tube_radius``. Raises InputError for what is no machine of legs
-    between a base and a platform.
-    """
-    if extra := [name for name in given if name != "tube_radius"]:
-        raise InputError(
-            "a model of bodies has all dimensions",
-            where="--from",
-            found=f"{listed(list(map(option_of, extra)))} besides",
-            expected="no dimension but --tube-radius",
-        )
-    text = read_text(path, largest=LARGEST_MODEL_FILE)
-    try:
-        return _nominal(*_read(path, text), path, given.get("tube_radius"))
-    except PkmcalError as error:
-        raise error.as_input(path.name) from None
+    def read(
+        self, text: str, path: Path, unit: str | None, given: Mapping[str, float]
+    ) -> NominalModel:
+        """Nominal model. Raises InputError for what is no machine of legs between a base and a
+        platform.
+        """
+        del unit
+        if len(text) > LARGEST_MODEL_FILE:
+            raise InputError(
+                "the file is too large",
+                where=path.name,
+                found=f"{len(text)} characters",
+                expected=f"at most {LARGEST_MODEL_FILE}",
+            )
+        try:
+            return _nominal(*_read(path, text), path, given.get("tube_radius"))
+        except PkmcalError as error:
+            raise error.as_input(path.name) from None
 
 
 def _read(path: Path, text: str) -> tuple[ReadModel, str]:

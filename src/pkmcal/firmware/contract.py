@@ -15,7 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from pkmcal.arrays import Array, short_repr
+from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import (
@@ -77,19 +77,42 @@ class Touches:
 
 
 @dataclass(frozen=True)
-class PartDistances:
-    """Distances between marks that the tool left on a printed part.
+class PrintedPart:
+    """Marks that the tool left on a printed part, and N distances between them, mm.
 
-    first, second : (n, 3) mm, positions of the carriages at the two marks.
-    values : (n,) mm. origin : the file they were read from, for messages.
+    label : the file that they were read from.
+    names : of the marks, n.
+    carriages : (n, 3) heights of the carriages when the marks were printed.
+    between : (N, 2) indices of marks.
+    distance : (N,) when the part was warm, its shrinkage undone.
+    noise : standard deviation of a distance; None for the default.
+    shrinkage : share by which the part shrank as it cooled.
     """
 
-    first: Array
-    second: Array
-    values: Array
-    origin: str
+    label: str
+    names: tuple[str, ...]
+    carriages: Array
+    between: Integers
+    distance: Array
+    noise: float | None = None
+    shrinkage: float = 0.0
 
     __repr__ = short_repr
+
+    @classmethod
+    def of_pairs(cls, first: Array, second: Array, distance: Array, label: str) -> PrintedPart:
+        """Part whose N distances have two marks of their own each.
+
+        first, second : (N, 3) heights of the carriages at these, mm.
+        """
+        n = len(distance)
+        return cls(
+            label=label,
+            names=tuple(f"m{k:02d}{end}" for k in range(1, n + 1) for end in "ab"),
+            carriages=np.stack([first, second], axis=1).reshape(-1, 3),
+            between=np.arange(2 * n).reshape(n, 2),
+            distance=distance,
+        )
 
 
 @dataclass(frozen=True)
@@ -105,7 +128,7 @@ class Printer:
     carriages : map from tool points (n, 3) to carriage heights (n, 3), by the firmware's formulas.
     offset : (x, y, z) of the probe from the nozzle.
     touches : probed points in the same file that do not depend on its values, None for none.
-    distances : distances on a printed part, likewise.
+    part : printed part with its distances, likewise.
     step : carriage travel per motor step.
     steps : (3,) motor steps per mm of carriage travel, None if unknown.
     height_offset : what the firmware's height at home contains beyond the nozzle's, None for a
@@ -123,7 +146,7 @@ class Printer:
     carriages: Callable[[Array], Array]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     touches: Touches | None = None
-    distances: PartDistances | None = None
+    part: PrintedPart | None = None
     step: float = CARRIAGE_STEP
     steps: Array | None = None
     height_offset: float | None = None
@@ -202,7 +225,7 @@ class Firmware(Exporter, ABC):
         del text, path, printer
         return None
 
-    def distances(self, text: str, label: str, printer: Printer) -> PartDistances | None:
+    def distances(self, text: str, label: str, printer: Printer) -> PrintedPart | None:
         """Distances on a printed part in a console's output; None for a text without any."""
         del text, label, printer
         return None
@@ -239,7 +262,9 @@ class Firmware(Exporter, ABC):
         """The exported file; pins, speeds and the like remain the printer's own."""
         text = self.text(self.fit(source), source)
         lines = [
-            f"{one.name} = {one.value:.6g} {one.unit}, sigma {one.sigma:.2g}"
+            f"{one.name} = {one.value:.4f} {one.unit}, sigma {one.sigma:.2g}"
+            if one.sigma
+            else f"{one.name} = {one.value:.4f} {one.unit}, exact"
             for one in self.values(source)
             if one.sigma is not None
         ]

@@ -10,7 +10,9 @@ spool's radius R in the origin, the spool turns by ``2 U / k2 (sqrt(R^2 + k2 pos
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from fractions import Fraction
+from pathlib import Path
 from typing import ClassVar, final
 
 import numpy as np
@@ -26,6 +28,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import scales
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.starter.nominal import NominalLeg, NominalModel, millimetres
+from pkmcal.starter.sources import StarterSource
 
 HANGPRINTER_FILE = "hangprinter.g"
 ANCHOR_LETTERS = "ABCDIJ"
@@ -37,11 +40,13 @@ LINE_ROUNDING = 2e-7
 """Tolerance of a line's position, m: numbers are written to nine digits."""
 SPOOL_LETTERS = "RUOLH"
 """Letters of M666 with a value for each axis."""
+SHORTEST_LINE = 50.0
+"""Bound below which the longest line, mm, shows anchors in other units: metres or inches."""
 ANCHOR_SIGMA = 0.01
 """Standard deviation of an anchor that was measured with a tape, m."""
 _K6 = re.compile(r"^[ \t]*M669[^;\n]*?[ \t]K6(?![0-9])", re.MULTILINE)
 _COMMAND = re.compile(r"^[ \t]*(M669|M666)([^;\n]*)", re.MULTILINE)
-_WORD = re.compile(r"([A-Z])([-+.0-9:eE]+)")
+_WORD = re.compile(r"([A-Z])([-+.,0-9:eE]+)")
 
 
 @final
@@ -193,9 +198,24 @@ def _spools(machine: Machine) -> dict[str, Array]:
 # Reading
 
 
-def is_hangprinter(text: str) -> bool:
-    """Whether a configuration makes RepRapFirmware a Hangprinter."""
-    return _K6.search(text) is not None
+@final
+class HangprinterConfiguration(StarterSource):
+    """RepRapFirmware's configuration of a Hangprinter."""
+
+    title: ClassVar = "a Hangprinter's configuration"
+    recognised: ClassVar = "RepRapFirmware's line 'M669 K6' of a Hangprinter"
+
+    def claims(self, text: str, path: Path) -> bool:
+        """Whether a configuration makes RepRapFirmware a Hangprinter."""
+        del path
+        return _K6.search(text) is not None
+
+    def read(
+        self, text: str, path: Path, unit: str | None, given: Mapping[str, float]
+    ) -> NominalModel:
+        """Nominal model. Raises InputError for a configuration without the anchors."""
+        del unit, given
+        return _model(text, path.name)
 
 
 def hangprinter_words(text: str, label: str) -> dict[str, Array]:
@@ -256,13 +276,20 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
     return out
 
 
-def hangprinter_model(text: str, label: str) -> NominalModel:
+def _model(text: str, label: str) -> NominalModel:
     """Nominal model of a Hangprinter by its configuration: readings are the motors' turns if M666
     gives the spools, and otherwise the lines' positions. Raises InputError.
     """
     words = hangprinter_words(text, label)
     anchors = 1e-3 * words["anchors"]
     lengths = np.linalg.norm(anchors, axis=1)
+    if 1e3 * lengths.max() < SHORTEST_LINE:
+        raise InputError(
+            "the anchors are too near to the origin for a Hangprinter",
+            where=f"{label}, M669",
+            found=f"{1e3 * lengths.max():.4g} mm at most",
+            expected=f"{SHORTEST_LINE:g} mm or more: M669's coordinates are in mm",
+        )
     reads = "the lines' positions: their lengths less those in the origin"
     if spools := "R" in words:
         reads = "the motors' turns from the origin, positive where the line becomes longer"

@@ -42,7 +42,7 @@ from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     CARRIAGE_STEP,
     Firmware,
-    PartDistances,
+    PrintedPart,
     Printer,
     Touches,
     WrittenValues,
@@ -138,7 +138,7 @@ class Klipper(Firmware):
             carriages=partial(klipper_carriage_heights, parser),
             offset=_probe_offset(config),
             touches=saved_touches(config, ends, mm_a_step),
-            distances=saved_distances(config, ends, mm_a_step),
+            part=saved_distances(config, ends, mm_a_step),
             step=CARRIAGE_STEP if mm_a_step is None else float(mm_a_step.max()),
             remarks=config.remarks(),
         )
@@ -150,7 +150,7 @@ class Klipper(Firmware):
             return mesh_touches(read_config(text, path), printer)
         return touches
 
-    def distances(self, text: str, label: str, printer: Printer) -> PartDistances | None:
+    def distances(self, text: str, label: str, printer: Printer) -> PrintedPart | None:
         """Distances of DELTA_ANALYZE."""
         return analyzed_distances(console_of(text), label, printer)
 

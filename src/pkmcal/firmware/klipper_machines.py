@@ -13,16 +13,18 @@ from configparser import ConfigParser
 from itertools import takewhile
 from pathlib import Path
 from string import ascii_lowercase
+from typing import ClassVar, final
 
 import numpy as np
 
 from pkmcal.errors import InputError, legible
-from pkmcal.files import quoted, read_text
+from pkmcal.files import quoted
 from pkmcal.files.quantities import LARGEST_UNITLESS_LENGTH
 from pkmcal.firmware.klipper import ROTARY_ANGLES, Klipper, homed, klipper_arm_angles
 from pkmcal.firmware.klipper_config import KlipperConfig, read_config
 from pkmcal.firmware.klipper_probing import KLIPPER_STEPPERS
 from pkmcal.starter.nominal import NominalLeg, NominalModel
+from pkmcal.starter.sources import StarterSource
 
 ARM_MARGIN_BELOW = 5.0
 """Margin below the arms' lowest positions above the bed, degrees."""
@@ -38,26 +40,36 @@ OTHER_KINEMATICS: Mapping[str, str] = {
 """What there is for kinematics that are read elsewhere, or not at all."""
 
 
-def is_klipper(path: Path) -> bool:
-    """Whether a file shows that it is a configuration of Klipper."""
-    return path.is_file() and bool(Klipper().evidence(read_text(path), path.name))
+@final
+class KlipperMachine(StarterSource):
+    """printer.cfg of a rotary delta or a winch, and the files that it includes."""
 
+    title: ClassVar = "Klipper's configuration"
+    recognised: ClassVar = (
+        "Klipper's section [printer] with kinematics: rotary_delta or kinematics: winch"
+    )
 
-def klipper_model(path: Path) -> NominalModel:
-    """Nominal model of a rotary delta or a winch in a printer.cfg, and the files that it includes.
+    def claims(self, text: str, path: Path) -> bool:
+        """Whether a file shows that it is a configuration of Klipper."""
+        return bool(Klipper().evidence(text, path.name))
 
-    Raises InputError for other kinematics, and for missing or impossible values.
-    """
-    config = read_config(read_text(path), path)
-    text, where = config.entries.get("printer", {}).get("kinematics", ("", ""))
-    if text not in _MODELS:
-        raise InputError(
-            OTHER_KINEMATICS.get(text, "these kinematics are not those of a parallel machine"),
-            where=where or f"{config.label}, [printer]",
-            found=quoted(text),
-            expected=" or ".join(f"kinematics: {name}" for name in _MODELS),
-        )
-    return _MODELS[text](config)
+    def read(
+        self, text: str, path: Path, unit: str | None, given: Mapping[str, float]
+    ) -> NominalModel:
+        """Nominal model. Raises InputError for other kinematics, and for missing or impossible
+        values.
+        """
+        del unit, given
+        config = read_config(text, path)
+        name, where = config.entries.get("printer", {}).get("kinematics", ("", ""))
+        if name not in _MODELS:
+            raise InputError(
+                OTHER_KINEMATICS.get(name, "these kinematics are not those of a parallel machine"),
+                where=where or f"{config.label}, [printer]",
+                found=quoted(name),
+                expected=" or ".join(f"kinematics: {one}" for one in _MODELS),
+            )
+        return _MODELS[name](config)
 
 
 def _rotary_delta(config: KlipperConfig) -> NominalModel:

@@ -34,7 +34,7 @@ from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     LARGEST_PRINTER_VALUE,
     NUMBER,
-    PartDistances,
+    PrintedPart,
     Printer,
     Touches,
     means_by_position,
@@ -46,6 +46,8 @@ from pkmcal.firmware.klipper_config import KlipperConfig, Sections
 
 MOST_CARRIAGE_STEPS = 1e9
 """Bound on steps from an end switch; more would be kilometres of carriage travel."""
+LARGEST_MESH_HEIGHT = 1e3
+"""Bound on the heights of a mesh, mm."""
 MOST_MESH_POINTS = 200
 """Bound on the points of a mesh's row or column."""
 KLIPPER_STEPPERS = ("a", "b", "c")
@@ -81,7 +83,7 @@ def saved_touches(config: KlipperConfig, ends: Array, mm_a_step: Array | None) -
 
 def saved_distances(
     config: KlipperConfig, ends: Array, mm_a_step: Array | None
-) -> PartDistances | None:
+) -> PrintedPart | None:
     """Distances that DELTA_ANALYZE saved; arguments as for `saved_touches`."""
     names = _numbered(config, "distance")
     if not names:
@@ -90,7 +92,9 @@ def saved_distances(
     first, second = (
         _stable(config, [f"{name}_pos{end}" for name in names], ends, mm_a_step) for end in (1, 2)
     )
-    return PartDistances(first, second, np.array(values), f"{config.label}, [delta_calibrate]")
+    return PrintedPart.of_pairs(
+        first, second, np.array(values), f"{config.label}, [delta_calibrate]"
+    )
 
 
 def _numbered(config: KlipperConfig, kind: str) -> list[str]:
@@ -213,22 +217,33 @@ def _mesh_heights(entries: Sections, section: str, where: str) -> Array:
     """Heights (rows along y, columns along x) of a mesh, mm."""
     text = entries[section].get("points", ("", where))[0]
     rows = [line.split(",") for line in text.splitlines() if line.strip()]
-    try:
-        z = np.array([[float(word) for word in row] for row in rows])
-    except ValueError:  # words that are no numbers, or rows of different lengths
-        z = np.zeros((0, 0))
+    heights = [[_height(word) for word in row] for row in rows]
+    wrong = next(
+        (word for row in rows for word in row if not abs(_height(word)) < LARGEST_MESH_HEIGHT), None
+    )
     sizes = [entries[section].get(f"{c}_count", ("", ""))[0] for c in "xy"]
-    inside = z.ndim == 2 and all(2 <= n <= MOST_MESH_POINTS for n in z.shape)
-    if not inside or [str(n) for n in z.T.shape] != sizes or not (np.abs(z) < 1e3).all():
+    z = np.array(heights) if len({len(row) for row in rows}) == 1 else np.zeros((0, 0))
+    inside = all(2 <= n <= MOST_MESH_POINTS for n in z.shape)
+    if wrong is not None or not inside or [str(n) for n in z.T.shape] != sizes:
         raise InputError(
             "the mesh cannot be read",
             where=where,
-            found=f"{len(rows)} rows of points, x_count {sizes[0] or 'missing'}, y_count"
+            found=f"a height {quoted(wrong.strip())}"
+            if wrong is not None
+            else f"{len(rows)} rows of points, x_count {sizes[0] or 'missing'}, y_count"
             f" {sizes[1] or 'missing'}",
-            expected=f"y_count rows of x_count heights in mm, at most {MOST_MESH_POINTS}, as"
-            " SAVE_CONFIG wrote them",
+            expected=f"y_count rows of x_count heights below {LARGEST_MESH_HEIGHT:g} mm, at most"
+            f" {MOST_MESH_POINTS}, as SAVE_CONFIG wrote them",
         )
     return z
+
+
+def _height(word: str) -> float:
+    """Number of a text; NaN for another text."""
+    try:
+        return float(word)
+    except ValueError:
+        return np.nan
 
 
 def _faulty(config: KlipperConfig, grid: Array) -> np.ndarray:
@@ -252,7 +267,7 @@ def _faulty(config: KlipperConfig, grid: Array) -> np.ndarray:
     return inside
 
 
-def analyzed_distances(text: str, label: str, printer: Printer) -> PartDistances | None:
+def analyzed_distances(text: str, label: str, printer: Printer) -> PrintedPart | None:
     """Distances of DELTA_ANALYZE in a console's output or in klippy.log; None without any.
 
     Raises InputError for an incomplete set of measurements.
@@ -273,9 +288,9 @@ def analyzed_distances(text: str, label: str, printer: Printer) -> PartDistances
         raise InputError(
             "the measurements of the calibration object are not complete",
             where=label,
-            found=f"{name} with {len(words.get(name, ()))} values",
+            found=f"{name}={','.join(f'{value:g}' for value in words.get(name, ()))}",
             expected=", ".join(f"{one} with {size}" for one, size in ANALYZED.items())
-            + " values, and SCALE with one if the object was scaled",
+            + " values, and SCALE between 0.01 and 100 if the object was scaled",
         )
     angles = np.deg2rad(OBJECT_ANGLES)
     out = scale[0] * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
@@ -302,4 +317,4 @@ def analyzed_distances(text: str, label: str, printer: Printer) -> PartDistances
             expected="distances over the pillars' outer edges, in mm",
         )
     ends = [reachable_carriages(points, printer, label) for points in (first, second)]
-    return PartDistances(ends[0], ends[1], values, label)
+    return PrintedPart.of_pairs(ends[0], ends[1], values, label)

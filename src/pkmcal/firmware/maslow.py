@@ -9,6 +9,9 @@ repeat the positions of earlier ones. Semantics: the firmware's print_calibratio
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar, final
 
 import numpy as np
 
@@ -17,6 +20,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import csv_text, quoted, read_text
 from pkmcal.mechanisms import catalogue
 from pkmcal.starter import session_texts
+from pkmcal.starter.sources import SessionTexts, StarterSource
 
 BELTS = ("bl", "br", "tr", "tl")
 """Belts in the order of the built-in machine's legs."""
@@ -34,12 +38,27 @@ _RANGE = re.compile(r"range: \[[^\[\]]*\]")
 _NOISE = re.compile(r"^  noise: .*$", re.MULTILINE)
 
 
-def is_maslow_log(text: str) -> bool:
-    """Whether a text has belts' lengths as a Maslow 4 prints them."""
-    return _START.search(text) is not None
+@final
+class MaslowLog(StarterSource):
+    """Calibration log of a Maslow 4: a whole session."""
+
+    title: ClassVar = "a Maslow's log"
+    recognised: ClassVar = "the lines CLBM:[...] of a Maslow 4's calibration log"
+
+    def claims(self, text: str, path: Path) -> bool:
+        """Whether a text has belts' lengths as a Maslow 4 prints them."""
+        del path
+        return _START.search(text) is not None
+
+    def read(
+        self, text: str, path: Path, unit: str | None, given: Mapping[str, float]
+    ) -> SessionTexts:
+        """Complete session. Raises InputError for logs without positions or anchors."""
+        del unit, given
+        return _session_texts(text, path.name)
 
 
-def maslow_session_texts(text: str, label: str) -> dict[str, str]:
+def _session_texts(text: str, label: str) -> SessionTexts:
     """Texts by name of a complete session, without images. Raises InputError for other logs."""
     lengths, anchors = belt_lengths(text, label), _anchors(text, label)
     texts = session_texts("four-belt", "readings")

@@ -8,14 +8,12 @@ the values of its configuration, so the carriages at a mark are those of the com
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
@@ -27,7 +25,7 @@ from pkmcal.files import (
     read_yaml,
     validated_document,
 )
-from pkmcal.firmware.contract import Printer, reachable_carriages
+from pkmcal.firmware.contract import PrintedPart, Printer, reachable_carriages
 from pkmcal.wording import listed
 
 MOST_MARKS, MOST_DISTANCES = 200, 1000
@@ -67,30 +65,6 @@ class PartDocument(Schema):
     )
     noise: Annotated[float, Field(gt=0, lt=10)] | None = None
     shrinkage: Annotated[Share, Field(ge=-MOST_SHRINKAGE, le=MOST_SHRINKAGE)] = 0.0
-
-
-@dataclass(frozen=True)
-class PrintedPart:
-    """Marks of a printed part and N distances between them, mm.
-
-    label : name of the file.
-    names : of the marks, n.
-    carriages : (n, 3) heights of the carriages when the marks were printed.
-    between : (N, 2) indices of marks.
-    distance : (N,) when the part was warm, its shrinkage undone.
-    noise : standard deviation of a distance; None for the default.
-    shrinkage : share by which the part shrank as it cooled.
-    """
-
-    label: str
-    names: tuple[str, ...]
-    carriages: Array
-    between: Integers
-    distance: Array
-    noise: float | None = None
-    shrinkage: float = 0.0
-
-    __repr__ = short_repr
 
 
 def read_part(path: Path, printer: Printer) -> PrintedPart:

@@ -13,7 +13,7 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.exporters.delta import MM_A_METRE
 from pkmcal.files import read_csv, read_text
-from pkmcal.firmware.contract import PartDistances, Printer, Touches, firmwares, touches_at
+from pkmcal.firmware.contract import PrintedPart, Printer, Touches, firmwares, touches_at
 
 FEWEST_BED_POINTS = 7
 """Fewest points that determine more than the bed's height and tilt; DELTA_CALIBRATE probes as many.
@@ -22,7 +22,7 @@ FEWEST_BED_POINTS = 7
 
 def read_measured(
     path: Path, printer: Printer, *, own: bool = False
-) -> tuple[Touches | None, PartDistances | None]:
+) -> tuple[Touches | None, PrintedPart | None]:
     """Read probed bed points, and distances on a printed part, of a file; None without any.
 
     The format follows from the contents of the file. The printer's values must be those in force

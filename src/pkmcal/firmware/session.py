@@ -10,8 +10,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
-from pkmcal.firmware.contract import CARRIAGE_STEP, PartDistances, Printer, Touches, read_printer
-from pkmcal.firmware.part import PrintedPart, read_part
+from pkmcal.firmware.contract import CARRIAGE_STEP, PrintedPart, Printer, Touches, read_printer
+from pkmcal.firmware.part import read_part
 from pkmcal.firmware.probed import FEWEST_BED_POINTS, read_measured
 from pkmcal.measurements.contract import MeasurementKind
 from pkmcal.measurements.distances import Distances
@@ -168,14 +168,15 @@ def printer_session_texts(
     delta = read_printer(printer, firmware)
     if in_view is None:
         # of the printer's own file, points that do not depend on its values come first
-        touches, distances = delta.touches, delta.distances
+        touches, printed = delta.touches, delta.part
         if probed is not None:
-            points, pairs = read_measured(probed, delta)
-            touches, distances = points or touches, pairs or distances
+            points, measured = read_measured(probed, delta)
+            touches, printed = points or touches, measured or printed
         elif touches is None:
-            touches, pairs = read_measured(printer, delta, own=True)
-            distances = pairs or distances
-        printed = _of_pairs(distances) if part is None else read_part(part, delta)
+            touches, measured = read_measured(printer, delta, own=True)
+            printed = measured or printed
+        if part is not None:
+            printed = read_part(part, delta)
         return heights_texts(delta, _checked_touches(delta, touches), printed)
     return carried_texts(delta, places)
 
@@ -285,20 +286,6 @@ def heights_texts(
         "poses.csv": csv_text(["z [mm]"], heights, touches.heights[:, None]),
         **distances,
     }
-
-
-def _of_pairs(distances: PartDistances | None) -> PrintedPart | None:
-    """The part of distances that have two marks of their own each."""
-    if distances is None:
-        return None
-    n = len(distances.values)
-    return PrintedPart(
-        label=distances.origin,
-        names=tuple(f"m{k:02d}{end}" for k in range(1, n + 1) for end in "ab"),
-        carriages=np.stack([distances.first, distances.second], axis=1).reshape(-1, 3),
-        between=np.arange(2 * n).reshape(n, 2),
-        distance=distances.values,
-    )
 
 
 def _part_text(part: PrintedPart) -> str:

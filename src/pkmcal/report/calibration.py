@@ -160,7 +160,7 @@ def report_of(
     # sections in the order of the page
     parts = (
         scene.section(session, estimate, centres, targets, over),
-        provenance.stations(session, observation, estimate) if session.station_names else None,
+        provenance.stations(session, observation, estimate),
         workspace.section(session, estimate, over) if over else None,
         parameters.section(session.machine, estimate),
         pictures.section(session, album) if session.stations else None,

@@ -45,7 +45,7 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
             _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned"),
         ),
         tables=(
-            _mounts(session, estimate),
+            *_mounts(session, estimate),
             *([_worst(session, poses, estimate, error)] if more_than_heights else []),
         ),
     )
@@ -90,16 +90,20 @@ def _length(values: Array) -> float:
     return float(np.sqrt(np.mean(np.nansum(values**2, axis=-1))))
 
 
-def _mounts(session: Session, estimate: Estimate) -> Table:
-    """Table of the targets' poses on platform or base."""
+def _mounts(session: Session, estimate: Estimate) -> tuple[Table, ...]:
+    """Table of the targets' poses on platform or base; none where all of them are open."""
     state, rows = estimate.state, list[Row]()
     for m, name in enumerate(mount_names(session, len(state.T_mount))):
         T, sigma = state.T_mount[m], np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0))
         determined = identified(estimate.machine, estimate.mount_covariance[m])
+        if not determined.any():
+            continue
         place = _texts(T[:3, 3], sigma[3:], determined[3:], 1e3)
         turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], determined[:3], 180 / np.pi)
         rows.append(Row(name, ("platform" if state.on_platform[m] else "base", *place, *turn)))
-    return Table(
+    if not rows:
+        return ()
+    table = Table(
         "Where it sits",
         ("Target", "Frame", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"),
         tuple(rows),
@@ -108,6 +112,7 @@ def _mounts(session: Session, estimate: Estimate) -> Table:
         brief=False,
         words=(1,),
     )
+    return (table,)
 
 
 def mount_names(session: Session, n: int) -> list[str]:

@@ -68,8 +68,8 @@ def used_images(session: Session, observation: Observation, estimate: Estimate) 
     )
 
 
-def stations(session: Session, observation: Observation, estimate: Estimate) -> Part:
-    """Section with a row for each station."""
+def stations(session: Session, observation: Observation, estimate: Estimate) -> Part | None:
+    """Section with a row for each station that has a pose; None without any."""
     camera = session.camera_of_station
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
@@ -95,6 +95,8 @@ def stations(session: Session, observation: Observation, estimate: Estimate) -> 
         rows.append(Row(station.name, cells, key=station_key(station.name)))
     # trackers come after the cameras' stations
     for s, table in enumerate(session.trackers, start=len(session.stations)):
+        if table.kind == "heights":  # a probe is on the tool
+            continue
         what = f"{table.label}, tracker, {table.kind}, {count(len(table.configuration), 'row')}"
         rows.append(
             Row(
@@ -103,6 +105,8 @@ def stations(session: Session, observation: Observation, estimate: Estimate) -> 
                 key=station_key(table.name),
             )
         )
+    if not rows:
+        return None
     columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
     columns += ("Edge shift, px",) if edges else ()
     what = "Camera" if session.stations else "Tracker"

@@ -3,7 +3,6 @@ genhexkins, or a CSV table.
 
 genhexkins (LinuxCNC's src/emc/kinematics): joint N is the length from ``base.N``, in the base
 frame, to ``platform.N``, in the platform frame; pins have the unit of the INI file's LINEAR_UNITS.
-``screw-lead`` adds lead / (2 pi) times the turn between the axes ``base-n.N`` and ``platform-n.N``.
 """
 
 from __future__ import annotations
@@ -14,15 +13,17 @@ import re
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
+from typing import ClassVar, final
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
-from pkmcal.files import MOST_MACHINE_LEGS, check_count, quoted, read_text
+from pkmcal.files import MOST_MACHINE_LEGS, check_count, quoted
 from pkmcal.files.quantities import LARGEST_UNITLESS_LENGTH, split_head
 from pkmcal.starter.families import DIMENSIONS
-from pkmcal.starter.nominal import NominalLeg, NominalModel, Screw, millimetres, option_of
+from pkmcal.starter.nominal import NominalLeg, NominalModel, Screw, millimetres
+from pkmcal.starter.sources import StarterSource
 from pkmcal.wording import listed
 
 UNITS: Mapping[str, float] = {"mm": 1e-3, "inch": 0.0254}
@@ -35,47 +36,67 @@ NEEDS, TAKES = ("leg",), ("travel", "tube_radius")
 _PIN = re.compile(r"^[^\S\n]*setp[^\S\n]+genhexkins\.(\S+)[^\S\n]+(\S+)", re.MULTILINE)
 
 
-def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> NominalModel:
-    """Nominal model of the joint centres in a file.
+@final
+class JointCentres(StarterSource):
+    """Joint centres of a hexapod, which need the legs' length at home."""
 
-    unit : of a HAL file, ``mm`` or ``inch``. given : dimensions besides the centres, m. Raises
-    InputError for another file, missing centres, and legs that do not reach.
-    """
-    text = read_text(path)
-    of_hal = _PIN.search(text) is not None
-    if not of_hal and path.suffix.lower() != ".csv":
-        raise InputError(
-            "the file has no machine that can be read",
-            where=path.name,
-            expected="LinuxCNC's lines 'setp genhexkins.base.0.x VALUE', a .csv table with the"
-            f" header {EXPECTED_HEADER}, or Klipper's section [printer] with kinematics"
-            " rotary_delta or winch",
-        )
-    if "leg" not in given or any(name not in (*NEEDS, *TAKES) for name in given):
-        raise InputError(
-            "joint centres need the legs' length at home, and no other radius, spacing or arm",
-            where="--from",
-            found=listed([option_of(name) for name in given]) or "no --leg",
-            expected="--leg LENGTH, and where known --travel and --tube-radius",
-        )
-    screws: tuple[Screw, ...] | None = None
-    if of_hal:
-        base, platform, screws = _of_hal(text, path.name, unit)
-    else:
-        if unit is not None:
+    title: ClassVar = "a file of joint centres"
+    recognised: ClassVar = (
+        "LinuxCNC's lines 'setp genhexkins.base.0.x VALUE', or a .csv table with the header"
+        f" {EXPECTED_HEADER}"
+    )
+    options: ClassVar = ("unit", *NEEDS, *TAKES)
+
+    def claims(self, text: str, path: Path) -> bool:
+        """Whether a text has pins of genhexkins, or a file is a table."""
+        return _PIN.search(text) is not None or path.suffix.lower() == ".csv"
+
+    def read(
+        self, text: str, path: Path, unit: str | None, given: Mapping[str, float]
+    ) -> NominalModel:
+        """Nominal model of the joint centres.
+
+        unit : of a HAL file, ``mm`` or ``inch``. given : dimensions besides the centres, m. Raises
+        InputError for missing centres, and for legs that do not reach.
+        """
+        if "leg" not in given:
             raise InputError(
-                "a table names its units in its header", where="--unit", expected=EXPECTED_HEADER
+                "joint centres need the legs' length at home",
+                where="--from",
+                found="no --leg",
+                expected="--leg LENGTH, and where known --travel and --tube-radius",
             )
-        base, platform = _of_table(text, path.name)
-    largest = float(np.abs([base, platform]).max())
-    if largest > LARGEST_UNITLESS_LENGTH:
-        raise InputError(
-            "a joint centre is too far from the frame's origin",
-            where=path.name,
-            found=f"{largest:.3g} m",
-            expected=f"at most {LARGEST_UNITLESS_LENGTH:g} m",
-            next_step="Check the unit",
-        )
+        screws: tuple[Screw, ...] | None = None
+        if _PIN.search(text):
+            base, platform, screws = _of_hal(text, path.name, unit)
+        else:
+            if unit is not None:
+                raise InputError(
+                    "a table names its units in its header",
+                    where="--unit",
+                    expected=EXPECTED_HEADER,
+                )
+            base, platform = _of_table(text, path.name)
+        largest = float(np.abs([base, platform]).max())
+        if largest > LARGEST_UNITLESS_LENGTH:
+            raise InputError(
+                "a joint centre is too far from the frame's origin",
+                where=path.name,
+                found=f"{largest:.3g} m",
+                expected=f"at most {LARGEST_UNITLESS_LENGTH:g} m",
+                next_step="Check the unit",
+            )
+        return _model(base, platform, path.name, given, screws)
+
+
+def _model(
+    base: Array,
+    platform: Array,
+    label: str,
+    given: Mapping[str, float],
+    screws: tuple[Screw, ...] | None,
+) -> NominalModel:
+    """Nominal model of centres (L, 3), m, and of the struts' screws."""
     home = _home(base, platform, given["leg"])
     lengths = np.linalg.norm(platform + home - base, axis=1)
     half = given.get("travel", 0.0) / 2
@@ -90,7 +111,7 @@ def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> N
     return NominalModel(
         "hexapod",
         (
-            f"A hexapod by the joint centres in {legible(path.name)}: legs of variable length, in"
+            f"A hexapod by the joint centres in {legible(label)}: legs of variable length, in"
             " that file's order. A reading is the leg's length"
             + (", with what a screw adds that its joints turn." if screws else "."),
         ),
