@@ -8,8 +8,8 @@ these formats in addition:
 =======================  =====================================================================
 ``{x:.2g mm}``           a number in m or rad, in another unit
 ``{x:amount m}``         the magnitude of a number in m or rad, two digits, in mm or degrees
-``{x:brief}``            a number of two digits, without an exponent
 ``{x+unit:amount}``      the same for a number with its unit
+``{x:brief}``            a number with two significant digits or more, without an exponent
 ``{x+s:ratio}``          the magnitude of a ratio and its standard deviation, in per cent
 ``{x+units:either .2g}`` noise of readings that are lengths (m), angles (rad) or both
 ``{x:range}``            ``0.5 to 2``, or ``more than 0.5`` if the second number is None
