@@ -124,10 +124,11 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
         return fk.T_base_platform
     bad = [session.configurations[k] for k in np.flatnonzero(~near)]
     _check_columns(session, bad)
+    gap = float(np.max(fk.error, where=np.isfinite(fk.error), initial=0.0))
     raise InputError(
         "the nominal model cannot take these readings: its legs do not meet the platform",
         where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
-        found=f"a gap of {amount(float(fk.error.max()), 'm')}",
+        found=f"a gap of {amount(gap, 'm')}" if gap else "legs that are too short for any pose",
         expected="readings at which all legs reach the platform",
         next_step="Check these readings, the order of their columns, and the nominal"
         " model's centres",
