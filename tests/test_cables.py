@@ -172,6 +172,17 @@ def test_derivatives_of_the_closure(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["pulley", "spool over pulley"])
+def test_a_pulley_in_millimetres(tmp_path, kind):
+    document = parse_yaml(mechanism_text(cables(tmp_path, kind)), tmp_path / "x.yaml").data
+    document["legs"][2]["base"]["radius"] = 40
+    (tmp_path / "x.yaml").write_text(yaml_text(document), encoding="utf-8")
+    with pytest.raises(InputError) as error:
+        load_mechanism(tmp_path / "x.yaml")
+    assert "leg 3" in error.value.what
+    assert error.value.found == "radius 40 m"
+
+
+@pytest.mark.parametrize("kind", ["pulley", "spool over pulley"])
 def test_derivatives_of_the_point_that_the_cable_leaves(tmp_path, kind):
     machine, poses = cables(tmp_path, kind), around_home(4, 2)
     layout, theta = machine.layout, machine.values

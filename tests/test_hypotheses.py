@@ -423,6 +423,9 @@ def test_ranges_show_what_is_wrong_with_whole_columns(unit):
         right = table_of(ranges, rng)
         factor = {"m": 1e3, "rad": 180 / np.pi}[unit]
         assert named_by_ranges(factor * right, ranges, unit) == ("readings.units", every)
+        column = int(rng.integers(len(ranges)))
+        single = np.where(np.arange(len(ranges)) == column, factor, 1.0) * right
+        assert named_by_ranges(single, ranges, unit) == ("readings.units", (column,))
         away = right - 2 * stroke.max()
         assert named_by_ranges(away, ranges, unit) == ("readings.zero", every)
         signs = np.where(np.arange(len(ranges)) % 2, 1.0, -1.0)

@@ -372,10 +372,10 @@ def scaled(factor):
 
 def test_lengths_in_millimetres(folder):
     (folder / "joints.csv").write_text(scaled(1e3))
-    message = fault(load_session, folder)
-    assert "joints.csv, line 2, column leg1: the readings look like millimetres" in message
-    text = "expected metres, between 0.345 and 0.485. Divide them by 1000, or head the columns leg1"
-    assert text in message
+    with pytest.raises(InputError) as caught:
+        load_session(folder)
+    assert caught.value.code == "readings.units"
+    assert caught.value.where.endswith("joints.csv, line 2, column leg1")
 
 
 def test_motors_in_degrees(folder):
@@ -386,8 +386,10 @@ def test_motors_in_degrees(folder):
     assert "this reading is outside the machine's range" in fault(load_session, folder)
     table = read_csv(folder / "joints.csv", label="joints.csv")
     ranges = np.tile([0.345, 0.485], (len(table.columns), 1))
-    with pytest.raises(InputError, match="line 2, column leg1: the readings look like degrees"):
+    with pytest.raises(InputError) as caught:
         check_readings(table, ranges, 1e-5, ["rad"] * len(table.columns))
+    assert caught.value.code == "readings.units"
+    assert caught.value.where.endswith("line 2, column leg1")
 
 
 def shifted(by, columns=range(6)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -191,6 +192,32 @@ def test_what_is_kept_is_what_was_done(tmp_path):
         )
         assert store.load(0, 1, task.batch) is None
         assert store.load(0, 0, replace(task.batch, runs=4)) is None
+
+
+def test_batches_of_other_code_are_refused(tmp_path):
+    """The version stays the same between releases, so the digest contains the modules' text."""
+    package = tmp_path / "source" / "pkmcal"
+    whole = Path(engine.__file__).parents[1]
+    shutil.copytree(whole, package, ignore=shutil.ignore_patterns("bundle", "__pycache__"))
+    script = (
+        "import sys; from pathlib import Path; from pkmcal.studies.store import Store\n"
+        "with Store.opened(Path(sys.argv[1]), 'counting', [], 0) as store:\n"
+        "    (store.folder / '000-00000.npz').touch()\n"
+    )
+    words = [sys.executable, "-c", script, str(tmp_path / "out")]
+    environment = {**os.environ, "PYTHONPATH": str(package.parent)}
+
+    def opened() -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            words, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+
+    assert [opened().returncode, opened().returncode] == [0, 0]
+    with (package / "solver" / "kernels.py").open("a") as file:
+        file.write("# changed\n")
+    refused = opened()
+    assert refused.returncode == 1
+    assert "InputError" in refused.stderr
 
 
 def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, one_process):

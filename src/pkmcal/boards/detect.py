@@ -13,6 +13,7 @@ import numpy as np
 
 from pkmcal.arrays import THREADS, Array, Integers
 from pkmcal.boards.board import Board, Detection, board_from_document, chessboard, dictionaries
+from pkmcal.boards.circles import find_circles
 from pkmcal.boards.find import (
     BOARD_DETECTION_OPTIONS,
     BoardDetectionOptions,
@@ -130,7 +131,7 @@ def _common_size(files: Sequence[Path]) -> tuple[int, int]:
         return usual
     turned = all(sizes[path] == usual[::-1] for path in odd)
     raise InputError(
-        "the images differ in size, so one camera as it was calibrated did not take them",
+        "the images differ in size",
         where=listed([path.name for path in odd]),
         found="{}x{} pixels".format(*sizes[odd[0]]),
         expected="{}x{}, as the other {}".format(*usual, counts[usual]),
@@ -318,9 +319,13 @@ def other_board(
         detection.
     """
     if board.type in ("chessboard", "circle_grid"):
-        # Markers first: one search, where chessboards need one for each size.
-        return _other_markers(image, "", options) or _other_chessboard(
-            image, board.counts if board.type == "chessboard" else (0, 0), part, options
+        # Markers and circles first: one search, where chessboards need one for each size.
+        return (
+            _other_markers(image, "", options)
+            or _other_circles(image, board, options)
+            or _other_chessboard(
+                image, board.counts if board.type == "chessboard" else (0, 0), part, options
+            )
         )
     name = board.document["dictionary"]
     if board.type == "charuco":
@@ -383,6 +388,19 @@ def _other_chessboard(
         if _all_corners(image, candidate, options.detection):
             return chessboard(candidate, 1.0).described
     return None
+
+
+def _other_circles(image: Integers, board: Board, options: OtherBoardOptions) -> str | None:
+    """Description of a grid of circles with the counts of a board of another type: symmetric
+    instead of a chessboard or an asymmetric grid, asymmetric instead of a symmetric grid.
+    """
+    asymmetric = board.type == "circle_grid" and not board.document["asymmetric"]
+    other = replace(board, type="circle_grid", document={"asymmetric": asymmetric})
+    return (
+        other.described
+        if find_circles(narrowed(image, options.width)[0], other) is not None
+        else None
+    )
 
 
 def _all_corners(image: Integers, counts: tuple[int, int], options: BoardDetectionOptions) -> bool:

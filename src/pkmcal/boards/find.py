@@ -134,7 +134,7 @@ def _charuco(
                 return count, mirrored, ""
             best = max(best, count, key=lambda raw: len(raw[0]))
     why = f"{markers} of the board's markers and {len(best[0])} corners are detected"
-    return best, False, why if markers else "none of the board's markers is detected"
+    return best, False, why if markers else "none of the board's markers"
 
 
 def charuco_detector(data: dict[str, Any], quick: bool = False) -> Any:
@@ -230,7 +230,7 @@ def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
 def _circles(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     centres = find_circles(image, board)
     if centres is None:
-        return _raw([], [], 0, False), False, f"{board.described} is not detected"
+        return _raw([], [], 0, False), False, f"no grid like {board.described}"
     return (np.arange(len(centres)), centres), False, ""
 
 
@@ -239,7 +239,7 @@ def _chessboard(
 ) -> tuple[Raw, bool, str]:
     pixels = find_chessboard(image, board.counts, quick, options=options)
     if pixels is None:
-        why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners is detected"
+        why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners"
         return _raw([], [], 0, False), False, why
     return (np.arange(len(pixels)), pixels), False, ""
 

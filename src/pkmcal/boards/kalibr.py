@@ -34,11 +34,23 @@ def board_fields(document: Document) -> dict[str, Any]:
         value = document.data.get(key)
         if not isinstance(value, int | float) or (isinstance(value, bool) != (key == _ASYMMETRIC)):
             raise InputError(
-                "this is missing, or is not a number",
+                "a field is missing or has no number"
+                if key != _ASYMMETRIC
+                else "a field is missing or is neither true nor false",
                 where=document.where(key),
-                found=None if value is None else str(value),
+                found="nothing" if value is None else str(value),
                 expected=f"a value of {key}, as Kalibr has it",
+                next_step=f"Write {key} into the target file",
             )
+    sides = [document.data[key] for key in keys if key in ("rowSpacingMeters", "colSpacingMeters")]
+    if len(set(sides)) > 1:
+        raise InputError(
+            "the board's squares are not square",
+            where=document.where("rowSpacingMeters"),
+            found=f"{sides[0]:g} m beside colSpacingMeters {sides[1]:g} m",
+            expected="one length for both",
+            next_step="Measure a square along both sides, or print a board with square ones",
+        )
     return fields(document.data)
 
 
@@ -46,16 +58,8 @@ _ASYMMETRIC = "asymmetricGrid"
 
 
 def _checkerboard(data: Mapping[str, Any]) -> dict[str, Any]:
-    sides = data["colSpacingMeters"], data["rowSpacingMeters"]
-    if sides[0] != sides[1]:
-        raise InputError(
-            "the board's squares are not square",
-            where="rowSpacingMeters",
-            found=f"{sides[1]:g} m beside colSpacingMeters {sides[0]:g} m",
-            expected="one length for both",
-        )
     counts = [data["targetCols"], data["targetRows"]]
-    return {"type": "chessboard", "corners": counts, "square": sides[0]}
+    return {"type": "chessboard", "corners": counts, "square": data["rowSpacingMeters"]}
 
 
 def _aprilgrid(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -35,7 +35,7 @@ from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session, Station
 from pkmcal.session.poses import check_lengths
 from pkmcal.session.readings import frozen
-from pkmcal.wording import listed
+from pkmcal.wording import amount, listed
 
 ALLOWED_LEG_MISS = 2.0
 """Prior sigmas by which legs may miss the platform at the nearest nominal pose."""
@@ -124,10 +124,11 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
         return fk.T_base_platform
     bad = [session.configurations[k] for k in np.flatnonzero(~near)]
     _check_columns(session, bad)
+    gap = float(np.max(fk.error, where=np.isfinite(fk.error), initial=0.0))
     raise InputError(
         "the nominal model cannot take these readings: its legs do not meet the platform",
         where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
-        found=f"a gap of {float(fk.error.max()) * 1e3:.3g} mm",
+        found=f"a gap of {amount(gap, 'm')}" if gap else "legs that are too short for any pose",
         expected="readings at which all legs reach the platform",
         next_step="Check these readings, the order of their columns, and the nominal"
         " model's centres",

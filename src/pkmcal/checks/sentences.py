@@ -62,7 +62,8 @@ JOINT_COLUMNS = {
 }
 KINEMATICS_SENTENCE = (
     "The nominal machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
-    " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
+    " singular, 1 far). Assembly modes at the first readings: {0.assemblies}; the one at home is"
+    " taken."
 )
 
 

@@ -98,6 +98,7 @@ def camera_difference(a: Camera | Path | str, b: Camera | Path | str) -> CameraD
             where=other.name,
             found=f"{other.camera.image_size[0]} x {other.camera.image_size[1]}",
             expected=f"{one.camera.image_size[0]} x {one.camera.image_size[1]}, as in {one.name}",
+            next_step="Compare calibrations from images of one size",
         )
     pixels = pixel_grid(one.camera.image_size, CAMERA_CELLS)
     rays = one.camera.ray(pixels)
@@ -106,7 +107,9 @@ def camera_difference(a: Camera | Path | str, b: Camera | Path | str) -> CameraD
         raise InputError(
             "the two cameras have no direction in common",
             where=other.name,
+            found="no direction with a pixel in both",
             expected=f"a camera whose field overlaps that of {one.name}",
+            next_step="Check the two camera files",
         )
     # Weight of each cell by the standard deviation of its pixels, equal without covariances.
     spread = _spread(one.camera, other.camera, pixels[both], rays[both], np.eye(3))

@@ -210,7 +210,7 @@ class Machine:
 
     def check_home(self) -> None:
         """Raise InputError if neither a home pose nor the ranges of all readings are in the
-        file.
+        file, or if a cable over a pulley has no reading at home.
         """
         if self.document.home is None and not np.isfinite(self.joint_ranges).all():
             raise InputError(
@@ -218,6 +218,18 @@ class Machine:
                 expected="length.range on each actuated leg, or home: {position: [x, y, z]}",
                 next_step="add one of them, so that the right assembly can be chosen",
             )
+        if self.document.home is None or not self.layout.windings:
+            return
+        readings, actuated = self.inverse(self.home()), self.layout.actuated
+        for leg in np.concatenate([group.legs for group in self.layout.windings]).tolist():
+            radius = getattr(self.document.legs[leg].base, "radius", None)
+            if radius and actuated[leg] >= 0 and np.isnan(readings[actuated[leg]]):
+                raise InputError(
+                    what=f"the cable of leg {leg + 1} has no reading at home",
+                    found=f"radius {radius:g} m",
+                    expected="a platform joint outside the cable's pulley",
+                    next_step="Write the radius in metres, or with its unit, such as 40 mm",
+                )
 
     @cached_property
     def _home(self) -> Array:

@@ -75,8 +75,8 @@ def range_hypotheses(
     options: ReadingHypothesisOptions = READING_HYPOTHESIS_OPTIONS,
 ) -> list[ReadingHypothesis]:
     """Mistakes in whole columns of readings (K, m) that their ranges (m, 2) can show, with equal
-    prior odds: readings in millimetres or degrees, signs, and another zero point of all joints with
-    a unit, or of those that leave their range.
+    prior odds: signs, and readings in millimetres or degrees or another zero point of all joints
+    with a unit, or of those that leave their range.
 
     units : ``m`` or ``rad`` for each joint. Facts in addition: ``factor`` (m,) of the readings, and
     ``constants``, the smallest and largest by which all of them are in range.
@@ -87,9 +87,12 @@ def range_hypotheses(
     # fmax and fmin ignore NaN: an unknown range allows any constant
     least = np.fmax(low - slack - joints.min(axis=0), -np.inf)
     most = np.fmin(high + slack - joints.max(axis=0), np.inf)
+    outside = (joints.min(axis=0) < low - slack) | (joints.max(axis=0) > high + slack)
     for unit, factor in OTHER_UNITS.items():
-        if (kinds == unit).any():
-            out.append(_linear("readings.units", kinds == unit, factor))
+        same = kinds == unit
+        # all joints and those outside are one hypothesis where they are the same
+        for which in {tuple(each): each for each in (same, same & outside) if each.any()}.values():
+            out.append(_linear("readings.units", which, factor))
     stated, turned = (range_log_likelihood(sign * joints, ranges, options) for sign in (1, -1))
     reverse = (-joints.max(axis=0) >= low - slack) & (-joints.min(axis=0) <= high + slack)
     if (reverse & (turned > stated)).any():

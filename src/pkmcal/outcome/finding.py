@@ -9,6 +9,7 @@ these formats in addition:
 ``{x:.2g mm}``           a number in m or rad, in another unit
 ``{x:amount m}``         the magnitude of a number in m or rad, two digits, in mm or degrees
 ``{x+unit:amount}``      the same for a number with its unit
+``{x:brief}``            a number with two significant digits or more, without an exponent
 ``{x+s:ratio}``          the magnitude of a ratio and its standard deviation, in per cent
 ``{x+units:either .2g}`` noise of readings that are lengths (m), angles (rad) or both
 ``{x:range}``            ``0.5 to 2``, or ``more than 0.5`` if the second number is None
@@ -42,6 +43,7 @@ from pkmcal.errors import PkmcalError
 from pkmcal.wording import (
     DISPLAY_UNITS,
     amount,
+    brief,
     capital,
     count,
     how_often,
@@ -238,6 +240,7 @@ _FORMATS: dict[str, Callable[[Any, str], str]] = {
     "joined": lambda x, _: joined([str(name) for name in x]),
     "count": lambda x, rest: count(_number(x), rest),
     "amount": lambda x, rest: amount(abs(x), rest) if rest else amount(abs(x[0]), x[1]),
+    "brief": lambda x, _: brief(x),
     "ratio": lambda x, _: ratio_in_per_cent(*x),
     "either": _either,
     "range": _range,

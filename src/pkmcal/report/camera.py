@@ -164,11 +164,11 @@ def _board(c: CameraCalibration) -> Table:
             cells = (number(value * factor, places, signed=True), brief(sigma * factor), unit)
             rows.append(Row(f"{one.code}{side}", (*cells, state)))
     note = (
-        "Estimated, or the values that these would have if they were, with the probability of as"
-        " large ones by chance. Bend: out of the plane, of the middle from the border. Stretch: of"
-        " x against y."
+        "Values that are not estimated with the camera follow from one step of the fit; chance is"
+        " the probability of as large a value for a board as its file states. Bend: out of the"
+        " plane, of the middle relative to the border. Stretch: of x relative to y."
     )
-    columns = ("The board beside its file", "value", "1σ", "unit", "chance")
+    columns = ("Deviation of the board from its file", "Value", "1σ", "Unit", "Chance")
     return Table("", columns, tuple(rows), note, brief=c.bend is not None, words=(3,))
 
 

@@ -22,9 +22,10 @@ DIFFERENCE_ARROW_LENGTH = 0.05
 ARROW_EVERY = 2
 """Cells of the maps from arrow to arrow."""
 ROTATION_TEXT = (
-    "A's rays of the image's cells, rotated such that B's pixels of them differ least, by least"
-    " squares, each cell by its standard deviation if there is one: a rotation of the camera frame"
-    " is no difference of lenses. Points are at infinity."
+    "The rays of A's pixels are rotated such that B's pixels of the same rays differ least: a"
+    " rotation of the camera frame is no difference of lenses. The least squares are weighted by"
+    " the standard deviations of the pixels where the files have covariances. Points are at"
+    " infinity."
 )
 
 
@@ -65,7 +66,7 @@ def _cards(d: CameraDifference) -> tuple[Figure, ...]:
         Figure(
             "How far was the frame rotated?",
             ((brief(float(turn)), "°"),),
-            "best rotation of A's rays, which is not counted",
+            "best rotation of A's rays, which is not part of the difference",
         ),
     ]
     if d.chance is not None:
@@ -86,13 +87,13 @@ def _projection(d: CameraDifference) -> Table:
     )
     kinds = [("Difference", d.lengths)]
     if d.sigma is not None:
-        kinds.append(("by chance, 1σ", d.sigma))
+        kinds.append(("By chance, 1σ", d.sigma))
     rows: list[Row] = []
     for name, values in kinds:
         cells = (values[nearest], np.nanmedian(values), np.nanmax(values))
         texts = [brief(float(v)) if np.isfinite(v) else NO_VALUE_SIGN for v in cells]
         rows.append(Row(name, tuple(texts)))
-    columns = ("B's pixel minus A's, px", "centre", "median", "worst")
+    columns = ("B's pixel minus A's, px", "Centre", "Median", "Worst")
     return Table("How far pixels differ", columns, tuple(rows))
 
 

@@ -27,18 +27,11 @@ from pkmcal.wording import DISPLAY_UNITS, listed, number
 # so a larger range is movement.
 _SAME_SIGMAS = 6.0
 _UNITS = {
-    "m": (
-        "millimetres",
-        "metres",
-        "Divide them by 1000, or head the columns leg1 [mm] and so on",
-    ),
-    "rad": (
-        "degrees",
-        "radians",
-        "Multiply them by pi/180, or head them motor1 [deg] and so on",
-    ),
+    "m": ("millimetres", "metres", "Divide them by 1000", "mm"),
+    "rad": ("degrees", "radians", "Multiply them by pi/180", "deg"),
 }
-"""By SI unit: name of the likely wrong unit, that of the right one, and the remedy."""
+"""By SI unit: name of the likely wrong unit, that of the right one, the remedy, and the unit in a
+column's head."""
 
 
 TEMPERATURE_HEAD = re.compile(r"temperature(?: ?[\[(](?:°C|degC|C|K)[\])])?")
@@ -115,9 +108,11 @@ def _check_mistakes(table: CsvTable, ranges: Array, units: Sequence[str]) -> Non
     row = int(np.argmin(_inside(table.values, ranges)[:, column]))
     low, high = ranges[column]
     if best.hypothesis.code == "readings.units":
-        unit, expected, next_step = _UNITS[units[column]]
-        what = f"the readings look like {unit}"
+        unit, expected, remedy, symbol = _UNITS[units[column]]
+        what = f"the readings of {names} look like {unit}"
         expected = f"{expected}, between {low:g} and {high:g}"
+        further = " and so on" if len(motors) > 1 else ""
+        next_step = f"{remedy}, or head the column {table.columns[column]} [{symbol}]{further}"
     elif best.hypothesis.code == "readings.sign":
         what = f"the readings of {names} have the wrong sign"
         expected = f"{low:g} to {high:g}, where all of them lie with the other sign"

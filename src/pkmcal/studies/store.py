@@ -15,7 +15,10 @@ import zipfile
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from importlib.metadata import version
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +56,7 @@ class Store:
         """
         folder = out / BATCHES_FOLDER
         path = folder / STUDY_DESCRIPTION_FILE
-        own = {"study": title, "seed": seed, "pkmcal": version("pkmcal")}
+        own = {"study": title, "seed": seed, "pkmcal": version("pkmcal"), "code": code_digest()}
         own |= {"digest": digest([plainly(setting) for setting in settings], seed)}
         with alone_in(folder, "study"):
             if any(folder.glob("*.npz")):
@@ -112,11 +115,25 @@ class Store:
 
 
 def digest(settings: Any, seed: int) -> str:
-    """Hash that identifies a study: program version, settings and seed, but not the number of
-    runs.
+    """Hash that identifies a study: program version and code, settings and seed, but not the
+    number of runs.
     """
-    text = json.dumps([version("pkmcal"), settings, seed], sort_keys=True)
+    text = json.dumps([version("pkmcal"), code_digest(), settings, seed], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+@cache
+def code_digest() -> str:
+    """Hash of all modules of the program: between releases, code changes but not its version."""
+    out = hashlib.sha256()
+    folders: list[Traversable] = [files("pkmcal")]
+    for folder in folders:
+        for one in sorted(folder.iterdir(), key=lambda one: one.name):
+            if one.is_dir():
+                folders.append(one)
+            elif one.name.endswith(".py"):
+                out.update(one.read_bytes())
+    return out.hexdigest()
 
 
 def plainly(value: Any) -> Any:
@@ -151,4 +168,5 @@ def _description(path: Path) -> dict[str, Any]:
 
 def _description_text(description: Mapping[str, Any]) -> str:
     parts = [f"{description.get('study')}", f"seed {description.get('seed')}"]
-    return ", ".join([*parts, f"pkmcal {description.get('pkmcal')}"])
+    program = f"pkmcal {description.get('pkmcal')} with code {str(description.get('code'))[:8]}"
+    return ", ".join([*parts, program])
