@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pkmcal.api.result import Result
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, legible
 from pkmcal.firmware.session import printer_session_texts
 from pkmcal.mechanisms import catalogue
 from pkmcal.outcome import Outcome, Verdict
@@ -46,13 +46,15 @@ class NewResult(Result):
     """Files of a new session.
 
     texts : contents by name. of_printer : whether the nominal model is that of a firmware.
-    complete : whether nothing is missing. assumed : dimensions that were not given.
+    complete : whether nothing is missing. assumed : dimensions that were not given. remarks : on
+    what a printer's configuration leaves open.
     """
 
     texts: Mapping[str, str]
     of_printer: bool = False
     complete: bool = False
     assumed: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @cached_property
     def outcome(self) -> Outcome:
@@ -61,9 +63,15 @@ class NewResult(Result):
             command="new",
             title="New session",
             verdict=Verdict(True, "A session:" if self.complete else "A session to fill in:"),
-            findings=tuple(
-                note("session.assumed_dimension", "mechanism.yaml", option=option_of(name))
-                for name in self.assumed
+            findings=(
+                *(
+                    note("session.assumed_dimension", "mechanism.yaml", option=option_of(name))
+                    for name in self.assumed
+                ),
+                *(
+                    note("session.printer_remark", "mechanism.yaml", remark=legible(remark))
+                    for remark in self.remarks
+                ),
             ),
             document={"files": [*self.texts]},
         )
@@ -244,7 +252,7 @@ def new(
             found=" and ".join(extra) + " besides",
             expected="neither --machine nor --legs, and --probed or --board",
         )
-    texts = printer_session_texts(
+    texts, remarks = printer_session_texts(
         Path(printer),
         None if probed is None else Path(probed),
         "board" if board else None,
@@ -252,7 +260,7 @@ def new(
         firmware,
         None if part is None else Path(part),
     )
-    return NewResult(texts, of_printer=True, complete=not board)
+    return NewResult(texts, of_printer=True, complete=not board, remarks=remarks)
 
 
 def _nominal(

@@ -301,11 +301,11 @@ def _checked_words(
                 saved = _checked_words(read_text(override), OVERRIDE, override)
                 words |= saved[0]
                 places |= saved[1]
-                remarks = (f"{OVERRIDE} counts, which {label} loads with M501",)
+                remarks = (f"{OVERRIDE} counts, which {label} loads with M501.",)
             else:
                 remarks = (
                     f"{label} loads {OVERRIDE} with M501, which is not beside it: copy it there,"
-                    " for its values count",
+                    " for its values count.",
                 )
             continue
         try:

@@ -152,7 +152,7 @@ def write_printer_session(
 
     Raises InputError for files that lack necessary values.
     """
-    texts = printer_session_texts(printer, probed, in_view, places, firmware, part)
+    texts, _ = printer_session_texts(printer, probed, in_view, places, firmware, part)
     return write_texts(folder, texts)
 
 
@@ -163,8 +163,10 @@ def printer_session_texts(
     places: int = 1,
     firmware: str | None = None,
     part: Path | None = None,
-) -> dict[str, str]:
-    """Files of a printer's session by name; arguments as for `write_printer_session`."""
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Files of a printer's session by name, and remarks on its configuration; arguments as for
+    `write_printer_session`.
+    """
     delta = read_printer(printer, firmware)
     if in_view is None:
         # of the printer's own file, points that do not depend on its values come first
@@ -177,8 +179,10 @@ def printer_session_texts(
             printed = measured or printed
         if part is not None:
             printed = read_part(part, delta)
-        return heights_texts(delta, _checked_touches(delta, touches), printed)
-    return carried_texts(delta, places)
+        texts = heights_texts(delta, _checked_touches(delta, touches), printed)
+    else:
+        texts = carried_texts(delta, places)
+    return texts, delta.remarks
 
 
 def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
