@@ -192,9 +192,7 @@ def test_a_bed_stands_nowhere_along_itself(uneven, tmp_path):
     loaded = load(tmp_path / "result").stations[0]
     assert np.isinf(loaded.sigma_translation[:2]).all()
     assert dict(load_source(tmp_path / "result").T_base_camera) == {}
-    (places,) = [part for part in report_of(value).parts if part.name == "stations"]
-    (row,) = places.tables[0].rows
-    assert row.cells[:2] == ("open", "open")
+    assert "stations" not in [part.name for part in report_of(value).parts]
 
 
 def test_a_movement_is_a_number_where_it_is_determined():

@@ -10,10 +10,9 @@ from pkmcal.arrays import Integers
 from pkmcal.identify.bed import bed_by_parameters
 from pkmcal.identify.confirmation import RejectedUnit, rejected_units, rejections_of
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.identify.tool import platform_by_parameters, platform_sigma
 from pkmcal.identify.unidentified import Identification
-from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, VERDICT
+from pkmcal.identify.verdict import VERDICT, usual_scale
 from pkmcal.measurements import LinkSet, Measurements
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome.finding import Finding, doubtful, wrong
@@ -100,10 +99,9 @@ def _links(measurements: Measurements, estimate: Estimate) -> Iterator[Finding]:
     labels = [measurement_kinds()[links.kind].label for links in measurements.links]
     if s.dof_links < LEAST_CHECKED_SHARE * s.n_links:
         yield doubtful("links.unchecked", listed(labels), names=labels)
-    least = max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(Search.POSE_NOISE, s.dof_links))
     if s.link_scale > VERDICT.too_noisy:
         yield wrong("links.misfit", listed(labels), names=labels, scale=s.link_scale)
-    elif s.link_scale > least:
+    elif s.link_scale > usual_scale(s.dof_links):
         yield doubtful("links.scatter", listed(labels), names=labels, scale=s.link_scale)
 
 

@@ -25,7 +25,7 @@ class Search(StrEnum):
     OUTLINES = "tubes of another outline"
     DISCREPANCY = "components of the model discrepancy"
     OUTLIERS = "measured poses that disagree with all others"
-    POSE_NOISE = "poses that scatter more than stated"
+    POSE_NOISE = "poses, and what links them, that scatter more than stated"
     INTRINSICS = "the cameras' intrinsics of the files, compared with refined ones"
 
 

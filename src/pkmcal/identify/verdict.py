@@ -327,9 +327,13 @@ def _poses_misfit(
     )
     if share > options.too_many_rejected:
         yield wrong("poses.rejected_share", share=share, limit=options.too_many_rejected)
-    least = max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(Search.POSE_NOISE, s.dof_poses))
-    if least < s.pose_scale <= options.too_noisy:
+    if usual_scale(s.dof_poses) < s.pose_scale <= options.too_noisy:
         yield doubtful("poses.scatter", scale=s.pose_scale, **better)
+
+
+def usual_scale(dof: float) -> float:
+    """Largest noise scale of poses, or of what links them, that is no reason for a report."""
+    return max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(Search.POSE_NOISE, dof))
 
 
 def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
