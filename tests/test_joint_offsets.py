@@ -32,7 +32,7 @@ def with_joint_offset(folder, offset, end, seed=0):
     return made.folder
 
 
-@pytest.mark.parametrize("end", ["base", "platform"])
+@pytest.mark.parametrize("end", ["base", pytest.param("platform", marks=pytest.mark.slow)])
 def test_axes_that_do_not_meet_are_named(end, tmp_path):
     offset = 3e-3
     result = calibrate_session(with_joint_offset(tmp_path / end, offset, end))

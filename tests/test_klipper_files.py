@@ -338,7 +338,7 @@ def analyze(true, rng, caliper=0.02, scale=1.0, *, log=False):
 BUILT = printers.Settings(radius=105.6, angle=(210.3, 329.8, 90.0), rod=(270.3, 269.8, 270.1))
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.8])
+@pytest.mark.parametrize("scale", [1.0, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_a_printed_part_determines_the_size(scale, tmp_path):
     """Heights of DELTA_CALIBRATE and the twelve distances of DELTA_ANALYZE, from the files."""
     true, rng = printers.machine(BUILT, endstops=(0.5, -0.3, 0.2)), np.random.default_rng(3)

@@ -150,7 +150,7 @@ def test_a_lead_without_two_axes_is_refused(tmp_path):
     assert str(refused.value.where).endswith("legs[1].length.lead")
 
 
-@pytest.mark.parametrize("lead", [LEAD, -LEAD])
+@pytest.mark.parametrize("lead", [LEAD, pytest.param(-LEAD, marks=pytest.mark.slow)])
 def test_a_thread_of_the_other_hand_is_named(lead, tmp_path):
     (tmp_path / "true.yaml").write_text(mechanism_text(screw_hexapod()))
     made = make(tmp_path / "session", tmp_path / "true.yaml", n=40)

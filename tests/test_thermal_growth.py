@@ -37,7 +37,9 @@ def warmed(folder, drives, frame, seed=0, head="temperature [°C]", name="gough-
     return made
 
 
-@pytest.mark.parametrize("name", ["gough-stewart", "hexaglide"])
+@pytest.mark.parametrize(
+    "name", ["hexaglide", pytest.param("gough-stewart", marks=pytest.mark.slow)]
+)
 def test_growth_is_estimated(name, tmp_path):
     made = warmed(tmp_path / "session", DRIVES, FRAME, name=name)
     result = calibrate_session(made.folder)
