@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -13,12 +12,11 @@ import pytest
 
 from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.document import schema_text
+from viewer_project import VIEWER, WEB, viewer_project
 
-ROOT = Path(__file__).resolve().parents[1]
-VIEWER, WEB = ROOT / "viewer", ROOT / "src" / "pkmcal" / "web"
 SOURCES = ("package.json", "package-lock.json", "tsconfig.json", "vite.config.js", "src")
 FILES = (SCRIPT_FILE, STYLE_FILE)
-INSTALL_SECONDS, BUILD_SECONDS = 120, 300
+BUILD_SECONDS = 300
 
 
 def source_hash() -> str:
@@ -58,33 +56,7 @@ def test_the_lock_file_names_no_registry():
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory) -> Path:
-    """A copy of the viewer's project with its dependencies; without Node, or without those and
-    without a registry, the tests are skipped.
-    """
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip("NO NODE: the viewer was not built again (install Node 20.19 or newer)")
-    copy = tmp_path_factory.mktemp("tree") / "viewer"
-    shutil.copytree(VIEWER, copy, ignore=shutil.ignore_patterns("node_modules"))
-    (copy.parent / "src" / "pkmcal" / "web").mkdir(parents=True)
-    shutil.copy(WEB / "schema.json", copy.parent / "src" / "pkmcal" / "web")
-    if (VIEWER / "node_modules" / "vite").is_dir():
-        (copy / "node_modules").symlink_to(VIEWER / "node_modules", target_is_directory=True)
-        return copy
-    install = [npm, "ci", "--ignore-scripts", "--prefer-offline", "--fetch-retries=0",
-               "--fetch-timeout=10000"]  # fmt: skip
-    try:
-        done = subprocess.run(
-            install, cwd=copy, capture_output=True, text=True, timeout=INSTALL_SECONDS
-        )
-    except subprocess.TimeoutExpired:
-        pytest.skip("NO REGISTRY: npm ci takes too long; the viewer was not built again")
-    assert "EUSAGE" not in done.stderr, (
-        "package-lock.json does not fit package.json: " + done.stderr
-    )
-    if done.returncode:
-        pytest.skip(f"NO REGISTRY: the viewer was not built again: {done.stderr[-300:]}")
-    return copy
+    return viewer_project(tmp_path_factory.mktemp("tree"))
 
 
 def test_a_build_gives_the_same_bytes(project, tmp_path):
