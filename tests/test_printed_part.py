@@ -48,6 +48,14 @@ def part_of(printer, folder, text):
     return read_part(folder / "part.yaml", printer)
 
 
+def test_a_list_whose_only_entry_is_wrong_is_not_too_short(printer, tmp_path):
+    """The fault of the entry is named, in its line."""
+    text = PART[: PART.index("distances:")] + "distances:\n  - {from: middle, apart: 1}\n"
+    with pytest.raises(InputError) as refused:
+        part_of(printer, tmp_path, text)
+    assert "distances[1]" in refused.value.where
+
+
 def test_the_carriages_are_those_that_the_firmware_commanded(printer, tmp_path):
     """Spheres about the rods' upper ends meet at the drawing's positions."""
     part = part_of(printer, tmp_path, PART)

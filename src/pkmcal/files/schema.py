@@ -47,6 +47,9 @@ def validated_document(document: Document, model: type[SchemaModel]) -> SchemaMo
         return value
     except ValidationError as error:
         value = error.errors()
+        # entries of a list that have faults of their own are not counted: it is not too short
+        entries = {details["loc"][:-k] for details in value for k in range(1, len(details["loc"]))}
+        value = [d for d in value if d["type"] != "too_short" or d["loc"] not in entries]
         value.sort(key=lambda details: _line(document, details))
         schema = model.model_json_schema()
         faults = [_fault(document, schema, details) for details in value[:MOST_FAULTS_NAMED]]
