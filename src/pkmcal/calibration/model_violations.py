@@ -58,6 +58,7 @@ class DetectedViolation:
     value, sigma : (k,) estimates of its numbers, all that were found free together. tool : by how
     many of its standard deviations the platform's position moves if it is taken up, root mean
     square over the session's poses. shift : the same in m. kind : word for calibration.json.
+    rivals : columns of violations that explain the data as well, the likeliest first.
     """
 
     finding: Finding
@@ -67,6 +68,7 @@ class DetectedViolation:
     tool: float
     shift: float
     kind: str
+    rivals: tuple[Column, ...] = ()
 
     @property
     def code(self) -> str:
@@ -96,6 +98,7 @@ class DetectedViolation:
             "chance": self.score.adjusted,
             "moves_tool": self.shift,
             "moves_tool_in_sigmas": self.tool,
+            "rivals": [{"code": one.code, "of": one.subject} for one in self.rivals],
         }
 
 
@@ -180,8 +183,18 @@ def model_violations(
     fits = tests.fitted([k for k, _ in value])
     last = len(fits) - len(tubes)
     fits[last:] = [_tube_update(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
+    numbers = [k for k, _ in value]
     violations = tuple(
-        _detection(declared(k), score, fit, tool)
+        _detection(
+            declared(k),
+            score,
+            fit,
+            tool,
+            # a tube's value is that of its own lines
+            []
+            if k in dict(tube_scores)
+            else [listed[n] for n in tests.rivals(k, [n for n in numbers if n != k])],
+        )
         for (k, score), fit in zip(value, fits, strict=True)
     )
     return ModelViolations(violations, errors, estimate, discrepancy.random)
@@ -209,7 +222,7 @@ def _tube_update(fit: OneStepUpdate, one: Outline) -> OneStepUpdate:
 
 
 def _detection(
-    one: Column, score: Score, fit: OneStepUpdate, tool: ToolAccuracy
+    one: Column, score: Score, fit: OneStepUpdate, tool: ToolAccuracy, rivals: Sequence[Column]
 ) -> DetectedViolation:
     shifted = np.linalg.norm((tool.by_parameters @ fit.by_data)[:, 3:], axis=-1)
     shift = float(np.sqrt(np.nanmean(shifted**2)))
@@ -222,8 +235,11 @@ def _detection(
         for name, value in one.facts(fit.value, fit.sigma).items()
     }
     facts |= {"chance": score.adjusted, "tool_shift": shift, "tool_shift_sigmas": ratio}
+    facts["rivals"] = [f"{other.kind} ({other.subject})" for other in rivals]
     result = Finding(one.code, level, facts, one.subject)
-    return DetectedViolation(result, fit.value, fit.sigma, score, ratio, shift, one.kind)
+    return DetectedViolation(
+        result, fit.value, fit.sigma, score, ratio, shift, one.kind, tuple(rivals)
+    )
 
 
 def _reading_scales(

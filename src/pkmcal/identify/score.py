@@ -26,6 +26,13 @@ than one,
 (Liang and Zeger 1986). f is computed only for violations that would be named, and not for single
 readings, which belong to one configuration.
 
+Rivals
+------
+Two violations may have nearly the same rows after projection: over a small arc the sine of an
+eccentric encoder is nearly a scale. Violations are therefore compared as hypotheses are
+(:mod:`pkmcal.outcome.hypotheses`), by chi2 / 2 less the cost of their numbers: those that a named
+violation does not exclude are its rivals, and its finding names them.
+
 Memory
 ------
 Two passes over the rows, some configurations at a time: for an orthonormal basis Q of the range of
@@ -50,6 +57,7 @@ from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm, Search
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.measurements import Column
+from pkmcal.outcome.hypotheses import OPTIONS, parameter_cost
 from pkmcal.solver.elimination import Linear, eliminate
 from pkmcal.solver.ranks import inverse_root
 
@@ -168,6 +176,32 @@ class ScoreTests:
                 continue
             out.append((best, scores[best]))
         return out
+
+    def rivals(self, named: int, others: Sequence[int]) -> list[int]:
+        """Listed violations that a named one does not exclude, the likeliest first.
+
+        others : violations that are estimated in either case. Variants of the named violation, with
+        its code and subject, are no rivals.
+        """
+        listed, n = self._problem[2], int(np.count_nonzero(self._problem[0].observed))
+        meanings = {
+            (listed[k].code, listed[k].subject) for k in (named, *others) if k < len(listed)
+        }
+        free = [k for k, one in enumerate(listed) if (one.code, one.subject) not in meanings]
+
+        def likely() -> list[tuple[float, int]]:
+            scores = self.scores(others)
+            odds = [one.chi2 / 2 + parameter_cost(one.dof, n) for one in scores]
+            least = max(odds[named] - OPTIONS.act, OPTIONS.report)
+            return sorted(((odds[k], k) for k in free if odds[k] > least), reverse=True)
+
+        for _, k in likely():
+            if k not in self._scatter:
+                self._scatter[k] = self._scattered(k, others)
+        once: dict[tuple[str, str], int] = {}
+        for _, k in likely():
+            once.setdefault((listed[k].code, listed[k].subject), k)
+        return list(once.values())
 
     def fitted(self, freed: Sequence[int]) -> list[OneStepUpdate]:
         """One-step updates of some violations, all estimated together."""

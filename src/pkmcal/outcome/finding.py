@@ -76,7 +76,8 @@ class Finding:
     code : ``area.what``, such as readings.scale.
     level : severity.
     facts : numbers in SI units, texts, and lists of these, by name. Common names: value, sigma,
-        log_odds, tool_shift (m) and tool_shift_sigmas.
+        log_odds, tool_shift (m), tool_shift_sigmas, and rivals, other explanations that the data do
+        not exclude.
     subject : file, leg, column, station or configuration concerned.
     error : the error that the finding reports, if any.
     saved_text, saved_next_step : sentences of a finding that was read from a file, in the wording
@@ -128,7 +129,10 @@ class Finding:
             return self.saved_text, self.saved_next_step
         template = templates(self.code.partition(".")[0])[self.code]
         facts = {"subject": self.subject, **self.facts}
-        return filled(template["text"], facts), filled(template.get("next_step", ""), facts)
+        text = filled(template["text"], facts)
+        if facts.get("rivals"):  # of any model violation
+            text += " " + filled(templates("violation")["violation.rivals"]["text"], facts)
+        return text, filled(template.get("next_step", ""), facts)
 
 
 def finding(code: str, level: Level, subject: str = "", **facts: Any) -> Finding:
