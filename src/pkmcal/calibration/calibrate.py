@@ -47,6 +47,7 @@ from pkmcal.calibration.localization import (
 from pkmcal.calibration.model_violations import DetectedViolation, model_violations
 from pkmcal.calibration.outlier_explanations import outlier_explanations
 from pkmcal.calibration.pose_hypotheses import explain_closure, explain_poses
+from pkmcal.calibration.reading_effects import effect_notes, with_estimated_effects
 from pkmcal.calibration.refinement import (
     REFINEMENT,
     RefinementOptions,
@@ -57,7 +58,6 @@ from pkmcal.calibration.refinement import (
 )
 from pkmcal.calibration.rejections import rejection_findings, unused_configurations
 from pkmcal.calibration.summary import CalibrationSummary, Overview
-from pkmcal.calibration.thermal_growth import growth_notes
 from pkmcal.calibration.tube_radii import explain_radii
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import closest, quoted, resolved
@@ -512,7 +512,7 @@ def _judge(
         detections, errors, estimate, uneven = model_violations(
             session, turns.observation, turns.measurements, value.estimate
         )
-        value = value._replace(estimate=estimate)
+        value = value._replace(estimate=with_estimated_effects(session, estimate))
     identification = _identification(turns.measurements, without, uneven)
     others = (
         *_findings_of_estimate(
@@ -600,7 +600,7 @@ def _findings_of_estimate(
     yield from noise_notes(session, estimate, named, explained=uneven_bed)
     yield from lens_notes(turns.cameras)
     yield from size_notes(session, measurements, estimate)
-    yield from growth_notes(session, estimate)
+    yield from effect_notes(session, estimate)
     yield from scale_notes(session, estimate, tuple(one.of for one in detections))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.thermal_growth import thermal_effects
+from pkmcal.calibration.reading_effects import effects_of_session
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import Estimate
@@ -216,16 +216,17 @@ def measurements_of(
     for one in session.links:
         links.append(one.at_mount(len(mounts)))
         mounts.append(Mount(one.kind, "platform"))
+    effects = effects_of_session(session)
     measurements = Measurements(
         edges=edges,
-        joints=session.joints,
+        joints=sum((effect.correction for effect in effects), session.joints),
         joint_noise=session.joint_noise,
         n_stations=len(session.station_names),
         camera_of_station=session.camera_of_station,
         poses=concatenate(sets),
         mounts=tuple(mounts),
         links=tuple(links),
-        effects=thermal_effects(session),
+        effects=effects,
         level=np.array(
             [False] * len(session.stations) + [table.level for table in session.trackers],
             dtype=bool,

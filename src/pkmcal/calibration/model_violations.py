@@ -41,6 +41,7 @@ from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms import machine_from_document
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
 from pkmcal.mechanisms.closure import scales as scales_of
+from pkmcal.mechanisms.disturbances import compliance, tool_shift, weight_on_readings
 from pkmcal.mechanisms.joints import screw_turns
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
@@ -456,6 +457,35 @@ def _screw_leads(
     yield Column("machine.screw_lead", "screws", "screw lead", readings=by, facts=facts)
 
 
+def _sag(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Drives that yield under a load, of a stiffness that the mechanism file does not state; one
+    compliance for all of them.
+    """
+    del session, observation
+    machine, used = estimate.machine, estimate.configurations
+    load = machine.document.load
+    if load is None or compliance(machine) is not None or len(set(machine.joint_units)) > 1:
+        return
+    poses = estimate.state.T_base_platform[used]
+    by = np.zeros((*measured.joints.shape, 1))
+    by[used, :, 0] = weight_on_readings(machine, poses)
+    shift = tool_shift(machine, poses, by[used, :, 0])
+    size = float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1))))
+
+    def facts(value: Array, sigma: Array) -> dict[str, Any]:
+        return {
+            "value": value[0],
+            "sigma": sigma[0],
+            "mass": load.mass,
+            "sinks": size * value[0],
+            "stiffness": 1 / value[0] if value[0] > 0 else None,
+        }
+
+    yield Column("machine.sag", "drives", "sag under the load", readings=by, facts=facts)
+
+
 def _joint_offsets(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
@@ -507,6 +537,6 @@ def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
 
 TESTED = (
     _reading_scales, _reading_plays, _eccentric_encoders, _leaning_towers, _screw_leads,
-    _joint_offsets, _lenses, _lenses_of_stations, _boards, _tripods,
+    _joint_offsets, _sag, _lenses, _lenses_of_stations, _boards, _tripods,
 )  # fmt: skip
 """What a session takes for granted and that may be otherwise; each is a family of columns."""

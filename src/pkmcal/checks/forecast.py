@@ -163,6 +163,7 @@ def _planned_capture(inspection: Inspection, first: FirstEdges, images: int) -> 
             for k, (s, T, pools) in enumerate(cameras)
         ),
         shading=first.estimate.statistics.shading,
+        temperatures=inspection.session.temperature,
     )
     return _Capture(rig, poses[:wanted], readings[:wanted], np.concatenate(pairs))
 

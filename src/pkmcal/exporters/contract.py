@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from inspect import isabstract
@@ -25,6 +25,8 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError, ResultError, legible
 from pkmcal.exporters.samples import samples
 from pkmcal.files import check_own_folder, closest, write_folder
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.disturbances import compliance, growth_by_readings, sag, tool_shift
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.wording import listed
 
@@ -74,6 +76,7 @@ class Exporter(ABC):
         is not taken for the new one's.
     holds_screws : whether it has the screws that joints turn; other formats take readings to be
         lengths.
+    holds_effects : whether it has the sag under a load and the thermal growth.
     """
 
     name: ClassVar[str]
@@ -81,6 +84,7 @@ class Exporter(ABC):
     trial: ClassVar[str] = ""
     leaves: ClassVar[tuple[str, ...]] = ()
     holds_screws: ClassVar[bool] = False
+    holds_effects: ClassVar[bool] = False
 
     @abstractmethod
     def files(self, source: MachineSource) -> dict[str, str]:
@@ -166,6 +170,8 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
         source = replace(source, machine=machine.with_screws_held())
         change = largest(source.machine.inverse(poses), joints)
         more.append(note("export.without_screws", program=name, largest=change))
+    if not exporter.holds_effects:
+        more += _without_effects(machine, name)
     files = exporter.files(source)
     differences = tuple(exporter.check(files, source))
     for difference in differences:
@@ -179,6 +185,28 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
             )
     notes, values = (*more, *exporter.notes(source)), exporter.values(source)
     return Export(exporter, files, differences, notes, values)
+
+
+def _without_effects(machine: Machine, name: str) -> Iterator[Finding]:
+    """Notes on sag and thermal growth, with what they do to the tool, at the compared poses."""
+    sags, growth = compliance(machine) is not None, machine.document.growth
+    if not sags and growth is None:
+        return
+    poses, joints = samples(machine)
+    if sags:
+        sunk = np.linalg.norm(tool_shift(machine, poses, sag(machine, poses)), axis=-1)
+        yield note(
+            "export.without_sag", program=name, largest=largest(sunk), least=float(sunk.min())
+        )
+    if growth is not None:
+        by = growth_by_readings(machine, joints, poses) @ np.array([growth.drives, growth.frame])
+        moved = np.linalg.norm(tool_shift(machine, poses, by), axis=-1)
+        yield note(
+            "export.without_growth",
+            program=name,
+            temperature=growth.temperature,
+            per_kelvin=largest(moved),
+        )
 
 
 def write_export(made: Export, folder: Path) -> None:

@@ -7,6 +7,7 @@ this estimate only the measurements and the poses of platform and stations are u
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import compress
 from typing import Any
@@ -18,6 +19,7 @@ from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras.files import load_camera, written_camera
 from pkmcal.errors import InputError
+from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.progress import Progress
 from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose
@@ -63,6 +65,18 @@ def check_new(valid: Booleans, visible: Booleans, what: str, expected: str, next
             expected=expected,
             next_step=next_step,
         )
+
+
+def temperature_notes(saved: SavedCalibration, session: Session) -> Iterator[Finding]:
+    """Notes on the thermal growth of a calibrated machine in a session: applied, or not and why."""
+    growth, temperature = saved.machine.document.growth, session.temperature
+    if growth is not None and temperature is not None:
+        low, high = (float(end) for end in (temperature.min(), temperature.max()))
+        yield note("readings.growth_applied", low=low, high=high, calibrated=growth.temperature)
+    elif growth is not None:
+        yield doubtful("readings.growth_not_applied", calibrated=growth.temperature)
+    elif temperature is not None:
+        yield note("readings.growth_unknown", mean=float(temperature.mean()))
 
 
 def measured_new_data(

@@ -23,7 +23,13 @@ from pkmcal.errors import PkmcalError
 from pkmcal.files import json_value
 from pkmcal.judge.comparison import NominalComparison, compare_with_nominal
 from pkmcal.judge.holdouts import HoldOut, by_regions
-from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data, repeated_rows
+from pkmcal.judge.new_data import (
+    calibrated_rows,
+    check_new,
+    measured_new_data,
+    repeated_rows,
+    temperature_notes,
+)
 from pkmcal.judge.paths import LinePath, line_path, paths_of
 from pkmcal.judge.prediction import predict
 from pkmcal.judge.sentences import validation_verdict
@@ -144,7 +150,10 @@ def validate_calibration(
         return Validation(
             calibration=saved,
             session=session,
-            verdict=replace(verdict, findings=(*verdict.findings, *failed)),
+            verdict=replace(
+                verdict,
+                findings=(*verdict.findings, *failed, *temperature_notes(saved, session)),
+            ),
             judged=judged,
             remeasured=remeasured,
             calibrated=calibrated,

@@ -27,7 +27,12 @@ from pkmcal.identify.assembly import observed_configurations
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import CHANGE_ALPHA, ChangeTests, StationTest, detect_changes
 from pkmcal.judge.fixed_machine import Held, Trust, change_evidence, hold
-from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data
+from pkmcal.judge.new_data import (
+    calibrated_rows,
+    check_new,
+    measured_new_data,
+    temperature_notes,
+)
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.judge.watch_runs import Run, continued, run_of
 from pkmcal.measurements.rows import RowGroups
@@ -155,6 +160,8 @@ def watch_machine(
             stations_moved,
         )
         verdict = watch_verdict(judged, compared)
+        notes = (*verdict.findings, *temperature_notes(saved, session))
+        verdict = replace(verdict, findings=notes)
         tested = observed & ~calibrated
         return Watch(
             calibration=saved,

@@ -15,6 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.poses import BOARD_POSE_OPTIONS, pose_set
+from pkmcal.calibration.reading_effects import reading_effects
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse, skew
 from pkmcal.identify.assembly import Assembled, assemble, batch_of
@@ -168,6 +169,8 @@ class Rig:
     (S,) index of the camera. joint_noise : of a reading. mounts : of boards and targets, with poses
     T_mount (M, 4, 4). shading : px, standard deviation of the shift that edges of one side of a
     tube at one station share. where : prefix of a station's name in messages; None without a file.
+    temperatures : those that configurations will have, one after the other and again; None where
+    they are not read.
     """
 
     machine: Machine
@@ -180,6 +183,7 @@ class Rig:
     T_mount: Array | None = None
     shading: float = SHADING_SIGMA
     where: str | None = "session.yaml, stations."
+    temperatures: Array | None = None
 
     __repr__ = short_repr
 
@@ -226,6 +230,12 @@ class Rig:
             poses=concatenate(poses),
             mounts=self.mounts,
             shaded=len(edges) > 0,
+            effects=reading_effects(
+                self.machine,
+                joints,
+                T_base_platform,
+                None if self.temperatures is None else np.resize(self.temperatures, len(joints)),
+            ),
         )
 
     def assembled(

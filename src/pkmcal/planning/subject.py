@@ -334,6 +334,7 @@ def _rig(
         tuple(mounts),
         np.array(T_mount).reshape(-1, 4, 4),
         shading,
+        temperatures=session.temperature,
     )
     return rig, board, words
 

@@ -22,6 +22,8 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
 from pkmcal.measurements.effects import FOCAL_SIGMA
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.disturbances import compliance, grown_readings, growth_of, sag
+from pkmcal.mechanisms.document import STIFFNESS_TOLERANCE
 from pkmcal.mechanisms.kinematics import driven_towards
 from pkmcal.placement.configurations import draw_configurations, platform_unfolded, same_mode
 from pkmcal.placement.stations import (
@@ -41,9 +43,12 @@ from pkmcal.simulation.render import Sensor
 TRUTH_FILE = "truth.json"
 RANDOM_STREAMS = (
     "machine", "stations", "configurations", "readings", "room", "photographs", "board", "focal",
+    "effects",
 )  # fmt: skip
 READING_ROUNDING = 1e-9
 """Difference, in m or rad, up to which two readings at the end of a range are equal: rounding."""
+ROOM_TEMPERATURE = 20.0
+"""Temperature, °C, from which a machine warms."""
 HANDHELD_STATION_NAME = "phone"
 """Name in session.yaml of a station with a hand-held camera."""
 
@@ -76,7 +81,9 @@ class Settings:
     the legs and of the room. as_built : motors, rings and cables on the legs that are not in the
     nominal model. asked : these configurations instead of random ones. handheld : each image from a
     pose of its own about the machine, ``repeats`` of each configuration, with focal lengths that
-    vary by ``breathing``, one standard deviation; ``stations`` is then ignored.
+    vary by ``breathing``, one standard deviation; ``stations`` is then ignored. warming : K, by
+    which the machine warms over the session; its readings have the growth of drives and frame, and
+    images show it as it is at first.
     """
 
     stations: int | tuple[StationPose, ...] = default("simulate", "stations")
@@ -98,6 +105,7 @@ class Settings:
     as_built: bool = False
     handheld: bool = False
     breathing: float = FOCAL_SIGMA
+    warming: float = default("simulate", "warming")
     asked: RequestedConfigurations | None = None
 
     @property
@@ -109,6 +117,47 @@ class Settings:
 
 
 @dataclass(frozen=True)
+class TrueEffects:
+    """True effects on the readings.
+
+    compliance : of the drives, relative to the stated one; None without a stated one. temperature :
+    (K,) of the configurations. growth : (2,) of drives and frame, 1/K; None without temperatures.
+    """
+
+    compliance: float | None = None
+    temperature: Array | None = None
+    growth: Array | None = None
+
+    @classmethod
+    def draw(
+        cls, nominal: Machine, warming: float, count: int, rng: np.random.Generator
+    ) -> TrueEffects:
+        """Random effects by the stated stiffness and growth, by default the usual growth."""
+        compliant, temperature, growth = None, None, None
+        if compliance(nominal) is not None:
+            tolerance = nominal.document.tolerance.stiffness or STIFFNESS_TOLERANCE
+            # a compliance is positive
+            compliant = float(np.exp(tolerance * rng.standard_normal()))
+        if warming:
+            # as a body that is heated evenly, to 95 % of its last temperature
+            warmer = np.expm1(-3 * np.linspace(0, 1, count)) / np.expm1(-3)
+            temperature = ROOM_TEMPERATURE + warming * warmer
+            stated = growth_of(nominal, temperature)
+            growth = rng.normal([stated.drives, stated.frame], stated.sigma)
+        return cls(compliant, temperature, growth)
+
+    def readings(self, machine: Machine, joints: Array, poses: Array) -> Array:
+        """Readings (K, m) of drives that are at ``joints`` (K, m), at poses (K, 4, 4)."""
+        if self.compliance is not None:
+            joints = joints - self.compliance * sag(machine, poses)
+        if self.temperature is None or self.growth is None:
+            return joints
+        warmer = self.temperature - growth_of(machine, self.temperature).temperature
+        grown = grown_readings(machine, poses, warmer[:, None] * self.growth)
+        return joints + grown - machine.inverse(poses)
+
+
+@dataclass(frozen=True)
 class Truth:
     """Values that a user never has, in the base frame of the true machine's centres.
 
@@ -117,7 +166,8 @@ class Truth:
     joints : (K, m) exact readings. readings : (K, m) with noise. images : (M, 2) numbers of
     the station and the configuration of each image. seed : seed of all random numbers.
     T_base_board, T_platform_board : (4, 4) pose of the board, if any. repeats : images of each
-    pair. focal_scale : (S,) factors on the camera's focal lengths, for hand-held images.
+    pair. focal_scale : (S,) factors on the camera's focal lengths, for hand-held images. effects :
+    on the readings: temperatures, growth and compliance.
     """
 
     machine: Machine
@@ -134,6 +184,7 @@ class Truth:
     repeats: int = 1
     T_platform_board: Array | None = None
     focal_scale: Array | None = None
+    effects: TrueEffects | None = None
 
     __repr__ = short_repr
 
@@ -197,6 +248,7 @@ def draw_truth(
             rngs["board"],
         )
     noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
+    effects = TrueEffects.draw(nominal, settings.warming, len(joints), rngs["effects"])
     configurations = tuple(f"{k:04d}" for k in range(len(joints)))
     names = tuple(f"station{k + 1}" for k in range(len(poses)))
     if settings.handheld:
@@ -213,7 +265,7 @@ def draw_truth(
         rough=rough,
         T_base_platform=T_base_platform,
         joints=joints,
-        readings=joints + noise,
+        readings=effects.readings(machine, joints, T_base_platform) + noise,
         images=images,
         seed=seed,
         T_base_board=board if settings.board_on == "base" else None,
@@ -222,6 +274,7 @@ def draw_truth(
         focal_scale=1 + settings.breathing * rngs["focal"].standard_normal(len(poses))
         if settings.handheld
         else None,
+        effects=effects,
     )
 
 
@@ -330,8 +383,9 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
     ``parameters`` are the true values by name; ``stations`` hold 4x4 ``T_camera_base``;
     ``configurations`` hold 4x4 ``T_base_platform`` and the exact readings ``joints``;
-    ``images`` are pairs of names, with ``repeats`` images of each (one by default). No
-    estimator reads this file.
+    ``images`` are pairs of names, with ``repeats`` images of each (one by default);
+    ``compliance``, ``temperature`` and ``growth`` are those of the readings. No estimator reads
+    this file.
     """
     names = truth.machine.parameters.names
     return {
@@ -364,7 +418,18 @@ def truth_document(truth: Truth) -> dict[str, Any]:
             else {"T_platform_board": truth.T_platform_board.tolist()}
         ),
         **({"repeats": truth.repeats} if truth.repeats > 1 else {}),
+        **_effects_document(truth.effects or TrueEffects()),
     }
+
+
+def _effects_document(effects: TrueEffects) -> dict[str, Any]:
+    """Fields of ``truth.json`` about effects on the readings, those that there are."""
+    fields: dict[str, Any] = {}
+    if effects.temperature is not None and effects.growth is not None:
+        fields = {"temperature": effects.temperature.tolist(), "growth": effects.growth.tolist()}
+    if effects.compliance is not None:
+        fields["compliance"] = effects.compliance
+    return fields
 
 
 def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
@@ -405,4 +470,8 @@ def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
         repeats=data.get("repeats", 1),
         T_platform_board=np.array(data["T_platform_board"]) if "T_platform_board" in data else None,
         focal_scale=np.array(focal) if focal else None,
+        effects=TrueEffects(
+            data.get("compliance"),
+            *(np.array(data[key]) if key in data else None for key in ("temperature", "growth")),
+        ),
     )
