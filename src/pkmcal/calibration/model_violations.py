@@ -489,7 +489,7 @@ def _sag(
 def _joint_offsets(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Universal joints whose two axes do not meet, by the axes' distance e.
+    """Universal joints whose two axes do not meet as stated, by the axes' distance e.
 
     The second axis then lies e towards the other end, square to the first axis v. With the angle
     beta of the leg out of the plane square to v, the leg's length is |B - A| - e cos(beta), to
@@ -516,8 +516,12 @@ def _joint_offsets(
             by = np.zeros((*measured.joints.shape, 1))
             by[used, layout.actuated[j], 0] = across / scale[j]
 
-            def facts(value: Array, sigma: Array, side: str = side) -> dict[str, Any]:
-                return {"value": value[0], "sigma": sigma[0], "side": side}
+            stated = getattr(node, "offset", None) or 0.0
+
+            def facts(
+                value: Array, sigma: Array, side: str = side, stated: float = stated
+            ) -> dict[str, Any]:
+                return {"value": stated + value[0], "sigma": sigma[0], "side": side}
 
             yield Column(
                 "machine.joint_offset",

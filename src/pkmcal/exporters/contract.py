@@ -76,7 +76,8 @@ class Exporter(ABC):
         is not taken for the new one's.
     holds_screws : whether it has the screws that joints turn; other formats take readings to be
         lengths.
-    holds_effects : whether it has the sag under a load and the thermal growth.
+    holds_effects : whether it has the sag under a load, the thermal growth, and universal joints
+        whose axes do not meet; it is the mechanism file.
     """
 
     name: ClassVar[str]
@@ -165,12 +166,17 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
         )
     more: list[Finding] = []
     machine = source.machine
-    if len(machine.layout.screws) and not exporter.holds_screws:
+    if len(machine.layout.screws) and not (exporter.holds_screws or exporter.holds_effects):
         poses, joints = samples(machine)
         source = replace(source, machine=machine.with_screws_held())
         change = largest(source.machine.inverse(poses), joints)
         more.append(note("export.without_screws", program=name, largest=change))
     if not exporter.holds_effects:
+        if len(machine.layout.offsets):
+            poses, joints = samples(machine)
+            source = replace(source, machine=source.machine.with_meeting_axes(poses))
+            change = largest(source.machine.inverse(poses), joints)
+            more.append(note("export.without_joint_offsets", program=name, largest=change))
         more += _without_effects(machine, name)
     files = exporter.files(source)
     differences = tuple(exporter.check(files, source))

@@ -19,6 +19,7 @@ from pkmcal.mechanisms.carriers.contract import (
     IN_PLANE,
     PLANAR_MOTIONS,
     Site,
+    Winding,
     base_carriers,
     platform_carriers,
 )
@@ -29,7 +30,7 @@ from pkmcal.mechanisms.document import (
     MechanismDocument,
     PassiveLength,
 )
-from pkmcal.mechanisms.joints import equations, screws
+from pkmcal.mechanisms.joints import equations, joint_offsets, screws
 from pkmcal.mechanisms.motors import bodies, motor_columns, sharing
 from pkmcal.wording import listed
 
@@ -52,6 +53,7 @@ def check_nominal(document: MechanismDocument, where: PlaceInDocument | None = N
         if document.motion in ("translation", "planar-translation"):
             _check_parallel(j, leg, place)
         _check_screw(document, j, leg, place)
+        _check_offsets(document, j, leg, place)
         if base.driven and not isinstance(leg.length, ConstantLength):
             raise InputError(
                 f"leg {j + 1} is moved by its {leg.base.joint}, so its rod has one length",
@@ -89,6 +91,31 @@ def _check_screw(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDo
             found=f"{leg.base.joint} and {leg.platform.joint}, motion: {document.motion}",
             expected="motion: spatial, and joint: universal with axis: [x, y, z] at both ends",
             next_step="Give both joints' axes, or leave out lead",
+        )
+
+
+def _check_offsets(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDocument) -> None:
+    """Check that a leg with joints whose axes do not meet is a rod between fixed joints of a
+    spatial machine, and is measured in no image.
+    """
+    if j not in joint_offsets(document):
+        return
+    base = base_carriers()[leg.base.joint]
+    if document.motion != "spatial" or base.driven or issubclass(base, Winding):
+        raise InputError(
+            f"leg {j + 1} has a joint whose axes do not meet, which only rods between fixed joints"
+            " of spatial machines can have",
+            where=place("legs", j),
+            found=f"base: {leg.base.joint}, motion: {document.motion}",
+            expected="motion: spatial, and a base joint that no motor moves",
+        )
+    if leg.tubes:
+        raise InputError(
+            f"leg {j + 1} has a joint whose axes do not meet: where its tubes are in images is not"
+            " modelled",
+            where=place("legs", j, "tubes"),
+            expected="no tubes",
+            next_step="Leave them out, and observe a board on the platform, or use a tracker",
         )
 
 
