@@ -189,10 +189,12 @@ def measurements_of(
     boards: Boards,
     edges: EdgeSet | None = None,
     cameras: CameraRefinement | None = None,
+    estimate: Estimate | None = None,
 ) -> Measurements:
     """Measurements of a session's images and tables, by the present cameras.
 
-    cameras : None for the first, coarse estimate, which cannot refine any.
+    cameras : None for the first, coarse estimate, which cannot refine any. estimate : an earlier
+    one, by which effects on the readings are; by the nominal machine without it.
     """
     # Mounts: the board, then each tracker's target, then the points of links.
     mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
@@ -216,7 +218,7 @@ def measurements_of(
     for one in session.links:
         links.append(one.at_mount(len(mounts)))
         mounts.append(Mount(one.kind, "platform"))
-    effects = effects_of_session(session)
+    effects = effects_of_session(session, estimate)
     measurements = Measurements(
         edges=edges,
         joints=sum((effect.correction for effect in effects), session.joints),

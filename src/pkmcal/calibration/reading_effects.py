@@ -7,7 +7,8 @@ mean does to the readings is a known correction, and what is left of the coeffic
 of the estimate, with a column each (:mod:`pkmcal.measurements.columns`). The calibrated machine's
 file states the estimated coefficients, so that they apply to its later sessions.
 
-Forces and growth are those of the nominal machine at the readings, which is right to first order.
+Forces and growth are those of a machine at its poses: of the nominal one at the readings, which is
+right to first order, then of an estimate.
 """
 
 from __future__ import annotations
@@ -95,12 +96,16 @@ def reading_effects(
     return tuple(out)
 
 
-def effects_of_session(session: Session) -> tuple[ReadingEffect, ...]:
-    """Effects on a session's readings."""
+def effects_of_session(
+    session: Session, estimate: Estimate | None = None
+) -> tuple[ReadingEffect, ...]:
+    """Effects on a session's readings, by the nominal machine or by an earlier estimate."""
     if session.temperature is None and compliance(session.machine) is None:
         return ()  # kinematics may fail, or take their time
-    poses = session.forward.T_base_platform
-    return reading_effects(session.machine, session.joints, poses, session.temperature)
+    machine, poses = session.machine, session.forward.T_base_platform
+    if estimate is not None:
+        machine, poses = estimate.machine, estimate.state.T_base_platform
+    return reading_effects(machine, session.joints, poses, session.temperature)
 
 
 def with_estimated_effects(session: Session, estimate: Estimate) -> Estimate:

@@ -176,7 +176,8 @@ def refine_alternating(
         passes, images, blur = _checked_pass(
             session, images, estimate, blur, scatter, cameras.active, done, options
         )
-        measurements = measurements_of(session, boards, _edges(passes, options), cameras)
+        edges = _edges(passes, options)
+        measurements = measurements_of(session, boards, edges, cameras, estimate)
         lap("observe")
         now("Identifying", 0.3)
         before = estimate
@@ -282,7 +283,8 @@ def imputation_variance(
             passes = _measurement_pass(
                 session, images, drawn, turns.blur, turns.scatter, cameras.active
             )
-            measurements = measurements_of(session, case.boards, _edges(passes, options), cameras)
+            edges = _edges(passes, options)
+            measurements = measurements_of(session, case.boards, edges, cameras, estimate)
             ended = bundle(session.machine, measurements, _without_camera_changes(drawn.state))
         except (PkmcalError, np.linalg.LinAlgError) as error:
             failures.append(str(error))
@@ -485,7 +487,8 @@ def identify_poses(
 ) -> RefinementResult:
     """Identification by boards, trackers and links alone.
 
-    Their measurements do not depend on the estimate, except through refined cameras.
+    Their measurements do not depend on the estimate, except through refined cameras and effects on
+    the readings.
     """
     progress("Identifying", 0.0)
     machine = session.machine
@@ -493,10 +496,11 @@ def identify_poses(
     start = start_state(machine, measurements, T_camera_base, session.forward)
     start = _feasible_start(session, measurements, start)
     estimate = bundle(machine, measurements, start)
-    for turn in range(1, options.passes if cameras.active else 1):
-        progress("Identifying with the cameras", turn / options.passes)
+    turns = options.passes if cameras.active else 2 if measurements.effects else 1
+    for turn in range(1, turns):
+        progress("Identifying again", turn / turns)
         cameras = cameras.updated(estimate)
-        measurements = measurements_of(session, boards, None, cameras)
+        measurements = measurements_of(session, boards, None, cameras, estimate)
         estimate = bundle(machine, measurements, _without_camera_changes(estimate.state))
     observation = observation_of(session, [], boards, measurements, estimate)
     return RefinementResult(observation, measurements, estimate, cameras, options=options)
