@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -15,11 +17,14 @@ from pkmcal.exporters.contract import make_export
 from pkmcal.exporters.samples import samples
 from pkmcal.files import yaml_text
 from pkmcal.geometry.rigid import perturb
+from pkmcal.judge.validate import validate_calibration
+from pkmcal.judge.watch import watch_machine
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.disturbances import sag, weight_on_readings
 from pkmcal.report.calibration import save
 from pkmcal.simulation import load_truth
 from test_pose_sessions import make, write_joints
+from test_thermal_growth import part
 
 STIFFNESS, MASS, CENTER = 4e5, 60.0, (0.02, -0.01, 0.08)
 SAG_NOTE = "export.without_sag"
@@ -110,6 +115,22 @@ def save_in(result, folder):
     save(result, folder / "out")
     assert load(folder / "out").machine.document.load.mass == MASS
     return folder / "out" / "mechanism.yaml"
+
+
+def test_a_calibration_applies_to_later_sessions(tmp_path):
+    whole, out = sagging(tmp_path / "whole", STIFFNESS, STIFFNESS / 0.75, n=60), tmp_path / "out"
+    save(calibrate_session(part(tmp_path / "first", whole, slice(40))), out)
+    later = part(tmp_path / "later", whole, slice(40, None))
+    validated = validate_calibration(out, later)
+    assert validated.verdict.usable
+    assert np.sqrt(np.mean(validated.judged.after**2)) < 4e-5
+    assert watch_machine(out, later).verdict.usable
+    # without its stiffness the calibrated machine is off
+    document = json.loads((out / "calibration.json").read_text(encoding="utf-8"))
+    for leg in document["mechanism"]["legs"]:
+        del leg["stiffness"]
+    (out / "calibration.json").write_text(json.dumps(document), encoding="utf-8")
+    assert not watch_machine(out, later).verdict.usable
 
 
 def test_a_load_without_a_stiffness_is_tested(tmp_path):
