@@ -77,6 +77,8 @@ def test_temperatures_are_the_last_column(head, tmp_path):
     session = load_session(made.folder)
     assert session.joints.shape == (40, 6)
     assert np.ptp(session.temperature) == pytest.approx(30, abs=0.1)
+    celsius = 35 - 273.15 * ("K" in head)
+    assert session.temperature.mean() == pytest.approx(celsius, abs=0.5)
 
 
 def part(folder, other, rows):

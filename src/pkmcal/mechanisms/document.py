@@ -253,7 +253,7 @@ Growing = Annotated[
 class Growth(Schema):
     """Thermal growth of lengths relative to those of the file, 1/K.
 
-    temperature : of the file's lengths, in the unit of the sessions' temperatures. drives : of
+    temperature : of the file's lengths, °C. drives : of
     screws, racks and their zeros. frame : of joint centres, arms and rods of constant length.
     sigma : standard deviations of drives and frame; correlation : of the two.
     """

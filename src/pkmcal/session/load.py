@@ -139,7 +139,7 @@ class Session:
     workspace : region in which the tool must be accurate; None if not stated.
     rejected : stations that were removed because their images do not determine their poses.
     links : measurements that depend on two configurations, by kind.
-    temperature : (K,) °C or K, of the configurations; None where joints.csv has none.
+    temperature : (K,) °C, of the configurations; None where joints.csv has none.
     """
 
     folder: Path

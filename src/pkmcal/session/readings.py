@@ -34,18 +34,23 @@ _UNITS = {
 column's head."""
 
 
-TEMPERATURE_HEAD = re.compile(r"temperature(?: ?[\[(](?:°C|degC|C|K)[\])])?")
-"""Head of the column of temperatures."""
+TEMPERATURE_HEAD = re.compile(r"temperature(?: ?[\[(](?:°C|degC|C|(K))[\])])?")
+"""Head of the column of temperatures; its group is kelvin."""
+ICE_POINT = 273.15
+"""0 °C, K."""
 
 
 def without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
-    """Table of the readings alone, and the temperatures (K,) of its last column, if it has one."""
-    if not table.columns or not TEMPERATURE_HEAD.fullmatch(table.columns[-1]):
+    """Table of the readings alone, and the temperatures (K,) of its last column, °C, if it has one;
+    those without a unit are as they are.
+    """
+    head = TEMPERATURE_HEAD.fullmatch(table.columns[-1]) if table.columns else None
+    if head is None:
         return table, None
     readings = replace(
         table, columns=table.columns[:-1], values=table.values[:, :-1], units=table.units[:-1]
     )
-    return readings, table.values[:, -1]
+    return readings, table.values[:, -1] - (ICE_POINT if head[1] else 0.0)
 
 
 def check_readings(
