@@ -92,12 +92,13 @@ class ImageEvidenceOptions:
     # machine of equal parts looks the same from each. The refusal names the pose as a rival
     pose_by_hand: float = 1000.0
     # share of the mean log-likelihood ratio of a localized machine's images by which another name
-    # has to be likelier, another numbering of its legs, or any mistake if a second search localizes
-    # the machine as stated: between two nearly equal configurations,
-    # and between equal parts of a machine, errors of the nominal model decide, of which the
-    # likelihood contains the scatter but not that all images of a station share them. Their effect
-    # grows with the evidence, so it is a share and no number of nats. On simulated machines,
-    # exchanged names had 0.2 to 2 times as much, right names up to 0.03
+    # has to be likelier, another numbering of its legs, or any mistake if the machine was not
+    # localized as stated: between two nearly equal configurations, between equal parts of a
+    # machine, and between a machine and its mirror image from the opposite side, errors of the
+    # nominal model decide, of which the likelihood contains the scatter but not that all images of
+    # a station share them. Their effect grows with the evidence, so it is a share and no number of
+    # nats. On simulated machines, exchanged names had 0.2 to 2 times as much, right names up to
+    # 0.03
     right_name_share: float = 0.1
 
 
@@ -333,8 +334,9 @@ def _likelier(
         )
         poses = np.stack([f.T_camera_base for f in (localization, own, *searched)])
         stated = likelihood_from(view, poses)
-        # a machine that only this search localizes was missed, rather than described wrongly
-        missed = own.good and not localization.good
+        # a machine that was not localized may have been missed, rather than described wrongly, and
+        # its mirror image fits from the opposite side as well as errors of the nominal model allow
+        missed = not localization.good
         margin = options.right_name_share * own.log_likelihood_ratio if missed else 0.0
         out = np.full(len(hypotheses), -np.inf)
         for k, (h, other, at) in enumerate(zip(hypotheses, views, searched, strict=True)):
