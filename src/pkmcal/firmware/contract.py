@@ -42,7 +42,7 @@ from pkmcal.exporters.delta import (
     workspace_radius,
 )
 from pkmcal.files import closest, quoted, read_text
-from pkmcal.outcome.finding import Finding
+from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import listed
 
 CARRIAGE_STEP = 1 / 80
@@ -54,6 +54,8 @@ LARGEST_PRINTER_VALUE = 1e6
 """Bound on lengths (mm) and angles (degrees); larger values would overflow when squared."""
 TOWER_ANGLES = (210.0, 330.0, 90.0)
 """Usual directions of the towers X, Y and Z, degrees, counted anticlockwise."""
+LEAST_PRIOR_SIGMA = 1e-4
+"""Prior sigma, mm, degrees or steps, below which a value is fixed: that of the written digits."""
 NUMBER = r"(-?\d+(?:\.\d+)?)"
 """Pattern of a number that a console prints."""
 
@@ -260,16 +262,22 @@ class Firmware(Exporter, ABC):
 
     def files(self, source: MachineSource) -> dict[str, str]:
         """The exported file; pins, speeds and the like remain the printer's own."""
-        text = self.text(self.fit(source), source)
+        values = self.values(source)
+        undetermined = [finding.text for finding in undetermined_values(values)]
         lines = [
-            f"{one.name} = {one.value:.4f} {one.unit}, sigma {one.sigma:.2g}"
-            if one.sigma
-            else f"{one.name} = {one.value:.4f} {one.unit}, exact"
-            for one in self.values(source)
+            f"{one.name} = {one.value:.4f} {one.unit},"
+            + (f" sigma {one.sigma:.2g}" if one.sigma else " exact")
+            + (", mostly by the nominal model" if one.by_nominal else "")
+            for one in values
             if one.sigma is not None
         ]
         head = ["Values and their standard deviations, before rounding:"] if lines else []
-        return {self.file: text + commented([*head, *lines], self.comment)}
+        text = self.text(self.fit(source), source)
+        return {
+            self.file: commented(undetermined, self.comment)
+            + text
+            + commented([*head, *lines], self.comment)
+        }
 
     def values(self, source: MachineSource) -> tuple[ExportedValue, ...]:
         """The firmware's values, with the standard deviations that the calibration gives them."""
@@ -283,7 +291,13 @@ class Firmware(Exporter, ABC):
         if sigmas is None:
             return values
         return tuple(
-            one._replace(sigma=sigma) for one, sigma in zip(values, sigmas.tolist(), strict=True)
+            one._replace(
+                sigma=sigma,
+                data_share=max(0.0, 1 - (sigma / prior) ** 2)
+                if prior > LEAST_PRIOR_SIGMA
+                else None,
+            )
+            for one, sigma, prior in zip(values, *map(np.ndarray.tolist, sigmas), strict=True)
         )
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
@@ -323,8 +337,22 @@ class Firmware(Exporter, ABC):
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """Agreement of settings and machine, and the steps after installing them."""
-        return (self.fit(source).following, *redo(source))
+        """Values that the data left to the nominal model, agreement of settings and machine, and
+        the steps after installing them.
+        """
+        undetermined = undetermined_values(self.values(source))
+        return (*undetermined, self.fit(source).following, *redo(source))
+
+
+def undetermined_values(values: Sequence[ExportedValue]) -> tuple[Finding, ...]:
+    """Warning with the names of values that the nominal model decides more than the data do; none
+    without such values.
+    """
+    names = [one.name for one in values if one.by_nominal]
+    if not names:
+        return ()
+    share = max(one.data_share or 0.0 for one in values if one.by_nominal)
+    return (doubtful("export.by_nominal", names=names, data_share=share),)
 
 
 def firmwares() -> list[Firmware]:
