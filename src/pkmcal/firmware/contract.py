@@ -8,8 +8,9 @@ writing share the firmware's names, units, signs and formulas.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import ClassVar
 
@@ -54,6 +55,8 @@ LARGEST_PRINTER_VALUE = 1e6
 """Bound on lengths (mm) and angles (degrees); larger values would overflow when squared."""
 TOWER_ANGLES = (210.0, 330.0, 90.0)
 """Usual directions of the towers X, Y and Z, degrees, counted anticlockwise."""
+LEAST_LIKENESS = 0.8
+"""Likeness, by difflib, of a misspelt key: two letters exchanged in five, or one wrong in five."""
 LEAST_PRIOR_SIGMA = 1e-4
 """Prior sigma, mm, degrees or steps, below which a value is fixed: that of the written digits."""
 NUMBER = r"(-?\d+(?:\.\d+)?)"
@@ -473,6 +476,51 @@ def reachable_carriages(points: Array, printer: Printer, label: str) -> Array:
             expected="the tool's own places, in mm, of the printer described in " + printer.label,
         )
     return carriages
+
+
+def misspelt_keys(names: Mapping[str, str], legal: Collection[str]) -> dict[str, str]:
+    """Names in a file that most likely mean one of a firmware's keys, as ``'delta_raduis' in line
+    7``, by that key; keys that the file has are not meant.
+
+    names : place by name, of all in the file or in a section of it. legal : the keys that are read.
+    """
+    absent = {key.lower(): key for key in legal if key not in names}
+    out: dict[str, str] = {}
+    for name, place in names.items():
+        if name not in legal:
+            near = get_close_matches(name.lower(), absent, n=1, cutoff=LEAST_LIKENESS)
+            out.update({absent[key]: f"{quoted(name)} in {place}" for key in near})
+    return out
+
+
+def misspelt_remarks(names: Mapping[str, str], legal: Collection[str]) -> tuple[str, ...]:
+    """Sentence for each misspelt key; arguments as for :func:`misspelt_keys`."""
+    return tuple(
+        f"{found} is not read: did you mean {key}?"
+        for key, found in misspelt_keys(names, legal).items()
+    )
+
+
+def missing_value(
+    name: str,
+    where: str,
+    expected: str,
+    names: Mapping[str, str],
+    legal: Collection[str],
+    next_step: str | None = None,
+) -> InputError:
+    """Error for a missing value of a printer, with the misspelt key that the file has instead.
+
+    names, legal : as for :func:`misspelt_keys`.
+    """  # fmt: skip
+    instead = misspelt_keys(names, legal).get(name)
+    return InputError(
+        f"this value of the printer is missing: {name}",
+        where=where,
+        found=instead,
+        expected=expected,
+        next_step=next_step if instead is None else f"Did you mean {name}? Correct the name",
+    )
 
 
 def means_by_position(points: Array) -> Array:
