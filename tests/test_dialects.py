@@ -4,6 +4,8 @@ and Repetier-Firmware's files.
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,8 @@ from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
 from pkmcal.exporters.delta import read_firmware_from_base
 from pkmcal.firmware.contract import firmwares, read_printer
-from pkmcal.firmware.session import nominal_text
+from pkmcal.firmware.probed import read_measured
+from pkmcal.firmware.session import nominal_text, printer_session_texts
 from pkmcal.geometry.rigid import apply
 from pkmcal.mechanisms import load_mechanism
 from test_marlin import CONFIGURATION
@@ -183,6 +186,34 @@ def test_values_that_config_g_loads_count_where_their_file_is_beside_it(tmp_path
     assert len(printer.remarks) == 1
     (tmp_path / "config.g").write_text(f"M501\n{own}")
     assert read_printer(tmp_path / "config.g").radius == 100
+
+
+def test_points_of_smoothieware_are_the_nozzles_at_contact(tmp_path):
+    printer = read_printer(text_file(tmp_path, CONFIG))
+    a = np.deg2rad(60 * np.arange(6) + 30)
+    want = np.column_stack([80 * np.cos(a), 80 * np.sin(a), 0.1 * np.arange(6)])
+    want = np.vstack([want, [0, 0, -0.2]])
+    text = "initial Bed ht is 295.000000 mm\ncenter probe: 0.0100\n"
+    text += "".join(f"< X{x:.4f} Y{y:.4f} Z{z:.4f}\n" for x, y, z in want)
+    touches, _ = read_measured(text_file(tmp_path, text + "max delta: 0.7\n", "log.txt"), printer)
+    ideal = Ideal(printer.radius, printer.angle, printer.rod, printer.homed)
+    np.testing.assert_allclose(ideal.tool(touches.carriages), want, atol=1e-3)
+    assert not touches.heights.any()
+    # G29 without its .1 prints the probe's travel
+    text = re.sub(r"X(\S+) Y(\S+) Z(\S+)", r"X:\1 Y:\2 Z:\3 A:1.0 B:1.0 C:1.0", text)
+    with pytest.raises(InputError) as caught:
+        read_measured(text_file(tmp_path, text, "log.txt"), printer)
+    assert "G29.1" in caught.value.next_step
+
+
+@pytest.mark.parametrize(("off", "reported"), [(0.5, False), (16.0, True), (-4.0, True)])
+def test_a_bed_far_from_z_0_is_a_remark(off, reported, tmp_path):
+    """As of a probe's offset with the wrong sign: the height at home would change by as much."""
+    (tmp_path / "printer.cfg").write_text(printers.printer_cfg(printers.Settings()))
+    lines = [f"probe at {x:.3f},{y:.3f} is z={off:.4f}" for x, y in printers.bed(13)]
+    (tmp_path / "probed.txt").write_text("\n".join(lines))
+    _, remarks = printer_session_texts(tmp_path / "printer.cfg", tmp_path / "probed.txt")
+    assert [f"Z {off:g} mm" in one for one in remarks] == ([True] if reported else [])
 
 
 # ------------------------------------------------------------------ misspelt names

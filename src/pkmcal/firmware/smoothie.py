@@ -7,6 +7,8 @@ circle of radius R, plus A, B and C, which are 0 here. Z of M665 and of M206 tog
 nozzle's height at home. A carriage is at ``height + sqrt(rod^2 - R^2) - trim`` where its switch
 triggers; its trim is that of M666, negative downwards.
 
+``G29.1`` of DeltaCalibrationStrategy.cpp prints the nozzle's positions at contact, seven places.
+
 The file config has the same as arm_length, arm1_trim, arm_radius, delta_tower1_offset,
 delta_tower1_angle, gamma_max, alpha_trim, beta_trim, gamma_trim and alpha_steps_per_mm.
 """
@@ -33,9 +35,12 @@ from pkmcal.firmware.contract import (
     TOWER_ANGLES,
     Firmware,
     Printer,
+    Touches,
     WrittenValues,
+    means_by_position,
     missing_value,
     misspelt_remarks,
+    touches_at,
 )
 from pkmcal.firmware.towers import (
     SettingNames,
@@ -73,6 +78,9 @@ CONFIG_WORDS = {
 OWN_KEYS = ("arm_length", "arm_radius")
 EMPTY: Mapping[str, str] = MappingProxyType(dict[str, str]())
 _HEADING = re.compile(r";\s*(Optional arm solution specific settings|Max Z\s*$)", re.MULTILINE)
+PROBING = "initial Bed ht is"
+"""Beginning of the output of G29 and G29.1 of the delta's calibration."""
+_PROBED = re.compile(r"\bX(-?\d{1,5}\.\d{4}) Y(-?\d{1,5}\.\d{4}) Z(-?\d{1,5}\.\d{4})(?!\S)")
 _CONFIG_LINE = re.compile(r"([a-z][a-z0-9_.]*)\s+([^\s=:]\S*)")
 """Key and value; with = or : between, the line is of another program, such as Klipper."""
 
@@ -116,6 +124,24 @@ class Smoothie(Firmware):
         # commands have no names that could be misspelt
         remarks = misspelt_remarks(names, CONFIG_WORDS) if names.keys() & CONFIG_WORDS else ()
         return replace(settings, remarks=remarks).printer(self, label)
+
+    def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
+        """Points of G29.1: the nozzle's positions at contact. Repeats at a place are averaged.
+
+        Raises InputError for the points of G29, whose heights begin at an unknown one.
+        """
+        if PROBING not in text:
+            return None
+        points = np.array(_PROBED.findall(text), dtype=float)
+        if len(points):
+            return touches_at(means_by_position(points), 0.0, printer, path.name)
+        raise InputError(
+            "these points of G29 have no heights, only how far the probe moved",
+            where=path.name,
+            found=PROBING,
+            expected="lines such as 'X-86.6000 Y-50.0000 Z0.1234'",
+            next_step="Probe with G29.1, which prints them",
+        )
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header of comments."""
