@@ -433,7 +433,7 @@ def _observe(session: Session, seed: int, clock: Clock) -> Case:
     """The case of a session with its stations localized, without hand-held images that could not be
     placed.
     """
-    clock.progress("Reading images", 0.0)
+    clock.progress("Reading images" if session.stations else "Reading the measurements", 0.0)
     images = read_images(session)
     clock.lap("decode")
     if any("board" in station.observe for station in session.stations):

@@ -7,6 +7,7 @@ Hypotheses about poses that disagree with the machine are in
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, VERDICT, RicherModel
+from pkmcal.levels import NOISE_EXCESS
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
@@ -33,6 +35,7 @@ from pkmcal.outcome.hypotheses import (
     posterior,
 )
 from pkmcal.session.load import Session
+from pkmcal.session.readings import rounding_step
 from pkmcal.wording import listed
 
 UNTOLD_BOARD_SIZE_SIGMA = 0.7
@@ -100,15 +103,32 @@ def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
     most = min({"m": tolerance.offset, "rad": tolerance.angle}[unit] for unit in units)
     if s.reading_scale <= 1:
         return
+    facts: dict[str, Any] = {
+        "noise": noise,
+        "units": sorted(units),
+        **_rounding(session, noise),
+    }
     if noise > most:
-        yield wrong("readings.noise_beyond_tolerance", noise=noise, limit=most, units=sorted(units))
+        yield wrong("readings.noise_beyond_tolerance", limit=most, **facts)
     elif s.reading_scale >= WRONG_MODEL_READING_SCALE:
-        yield wrong(
-            "readings.noise_beyond_encoders",
-            noise=noise,
-            scale=s.reading_scale,
-            units=sorted(units),
-        )
+        yield wrong("readings.noise_beyond_encoders", scale=s.reading_scale, **facts)
+
+
+def _rounding(session: Session, noise: float) -> dict[str, Any]:
+    """Facts on the step of which all readings are whole multiples, where its rounding scatters more
+    than session.yaml states; none otherwise.
+
+    noise : by which the readings scatter, m or rad.
+    """
+    units = set(session.machine.joint_units)
+    least = np.sqrt(12) * session.joint_noise
+    step = rounding_step(session.joints, min(units), least) if len(units) == 1 else None
+    if step is None:
+        return {}
+    rounding = float(step / np.sqrt(12))
+    if noise > NOISE_EXCESS * rounding:  # more than rounding explains
+        return {"round_command": step}
+    return {"rounded_to": step, "rounding": rounding}
 
 
 def richer_model(
@@ -176,15 +196,17 @@ def noise_notes(
     s, units = estimate.statistics, sorted(set(session.machine.joint_units))
     if s.reading_scale != 1 and not _within(1.0, s.reading_range):
         least, most = s.reading_range
+        noise = session.joint_noise * s.reading_scale
         yield doubtful(
             "readings.noise",
             "session.yaml, joints.noise",
-            noise=session.joint_noise * s.reading_scale,
+            noise=noise,
             stated=session.joint_noise,
             bound=session.joint_noise * most if most is not None and not least else None,
             range=s.reading_range,
             units=units,
             explained="yes" if detections else "no",
+            **(_rounding(session, noise) if s.reading_scale > 1 else {}),
         )
     only_trackers = session.trackers and not any("board" in x.observe for x in session.stations)
     if only_trackers and s.pose_range[1] is not None and s.pose_range[1] < 1:

@@ -86,7 +86,7 @@ def _check(folder: Path, seed: int, progress: Progress) -> SessionCheck:
     except PkmcalError as error:
         return SessionCheck(str(folder), (of_error(error), *findings))
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
-    progress("Reading images", 0.05)
+    progress("Reading images" if session.stations else "Reading the measurements", 0.05)
     images, broken = _decode_images(session)
     progress("Localizing the stations", 0.1)
     motion = _kinematics(session, np.random.default_rng(seed))

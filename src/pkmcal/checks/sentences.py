@@ -126,7 +126,7 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
     if session.heights_alone:  # the bed determines the configurations
         return findings
     crowded = [joint for joint in joints if joint.used < MAJORITY]
-    if crowded:
+    if crowded and not session.of_a_bed:
         names = [joint.name for joint in crowded]
         least = min(joint.used for joint in crowded)
         findings.append(note("readings.crowded", listed(names), columns=names, share=least))

@@ -25,6 +25,7 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError, ResultError, legible
 from pkmcal.exporters.samples import samples
 from pkmcal.files import check_own_folder, closest, write_folder
+from pkmcal.levels import MAJORITY
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.disturbances import compliance, growth_by_readings, sag, tool_shift
 from pkmcal.outcome.finding import Finding, note
@@ -57,13 +58,22 @@ class Difference:
 class ExportedValue(NamedTuple):
     """Value of a file under the target program's own name, and its standard deviation.
 
-    unit : mm, degrees or steps. sigma : None for a machine without a covariance.
+    unit : mm, degrees or steps.
+    sigma : None for a machine without a covariance.
+    data_share : share of the information that comes from the data, 1 - posterior variance / prior
+        variance; None without a covariance, and for a value that the mechanism file fixes.
     """
 
     name: str
     value: float
     unit: str
     sigma: float | None = None
+    data_share: float | None = None
+
+    @property
+    def by_nominal(self) -> bool:
+        """Whether the nominal model decides the value more than the data do."""
+        return self.data_share is not None and self.data_share < MAJORITY
 
 
 class Exporter(ABC):

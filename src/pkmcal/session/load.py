@@ -191,8 +191,13 @@ class Session:
     @property
     def heights_alone(self) -> bool:
         """Whether the session has only heights of a bed."""
+        return self.of_a_bed and not self.links
+
+    @property
+    def of_a_bed(self) -> bool:
+        """Whether all poses were measured by heights of a bed, whatever links there are."""
         felt = bool(self.trackers) and all(table.kind == Heights.code for table in self.trackers)
-        return felt and not self.stations and not self.links
+        return felt and not self.stations
 
     @property
     def station_names(self) -> tuple[str, ...]:
