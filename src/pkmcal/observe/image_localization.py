@@ -417,7 +417,7 @@ def _border(surprisal: Integers) -> int:
 
 
 def _scores(
-    visibility: Array,
+    points: Array,
     radius: Array,
     turn: float,
     chart: TubeChart,
@@ -427,16 +427,16 @@ def _scores(
     """Mean map value (P, shifts) at the middles of the tubes, weighted by their length in the
     image.
 
-    visibility : (P, T, 3, 3) first, middle and last points of the tubes in the camera frames of P
+    points : (P, T, 3, 3) first, middle and last points of the tubes in the camera frames of P
         positions.
     radius : (T,) m.
     turn : rotation about the optical axis, rad.
     windows : as :func:`_windows` returns them.
     """
     # chart coordinates of the points: angle from the optical axis, rotated by the turn
-    beside = np.hypot(visibility[..., 0], visibility[..., 1])
-    angle = np.arctan2(beside, visibility[..., 2])
-    cell = visibility[..., :2] * (chart.scale * angle / np.maximum(beside, 1e-12))[..., None]
+    beside = np.hypot(points[..., 0], points[..., 1])
+    angle = np.arctan2(beside, points[..., 2])
+    cell = points[..., :2] * (chart.scale * angle / np.maximum(beside, 1e-12))[..., None]
     cell = cell @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     # direction, apparent width and weight of each tube
     chord = cell[:, :, 2] - cell[:, :, 0]
@@ -445,7 +445,7 @@ def _scores(
         np.rint(normal % np.pi * (chart.options.directions / np.pi)).astype(np.intp)
         % chart.options.directions
     )
-    width = 2 * radius * chart.scale / np.sqrt(dot(visibility[:, :, 1], visibility[:, :, 1]))
+    width = 2 * radius * chart.scale / np.sqrt(dot(points[:, :, 1], points[:, :, 1]))
     weight = np.hypot(chord[..., 0], chord[..., 1])
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
     # first cell of each tube's window of shifts
@@ -454,8 +454,8 @@ def _scores(
     first = _border(chart.surprisal) - options.stride * (np.array(shifts[::-1]) // 2)
     at = np.clip(at + first, 0, np.array(windows.shape[3:1:-1]) - 1)
     which = chart.width_number(width)
-    out = np.empty((len(visibility), shifts[0] * shifts[1]), dtype=np.float32)
-    for k in range(0, len(visibility), options.batch):
+    out = np.empty((len(points), shifts[0] * shifts[1]), dtype=np.float32)
+    for k in range(0, len(points), options.batch):
         part = slice(k, k + options.batch)
         worth = windows[which[part], number[part], at[part, :, 1], at[part, :, 0]]
         worth = worth.reshape(*worth.shape[:2], -1).astype(np.float32)
