@@ -97,14 +97,16 @@ CALIBRATION_METHODS: tuple[str, ...] = get_args(CalibrationMethod)
 class Calibration(CalibrationSummary):
     """The result of a calibration.
 
-    boards : the calibration board, where stations observe one. identification : identifiability of
-    the machine's parameters. timings : seconds by step. holdout : configurations that the estimate
-    does not use, where requested; :func:`pkmcal.judge.holdouts.holdout_of` predicts them.
-    violations :
-    detected model violations. model_errors : smooth model errors without a name, which the
-    covariance contains. upside_down : images that were measured by their camera turned by half.
-    images : images of stations whose legs were observed, by the station's number; those that
-    fitted into memory are decoded.
+    boards : the calibration board, where stations observe one.
+    identification : identifiability of the machine's parameters.
+    timings : seconds by step.
+    holdout : configurations that the estimate does not use, where requested;
+        :func:`pkmcal.judge.holdouts.holdout_of` predicts them.
+    violations : detected model violations.
+    model_errors : smooth model errors without a name, which the covariance contains.
+    upside_down : images that were measured by their camera turned by half.
+    images : images of stations whose legs were observed, by the station's number; those that fitted
+        into memory are decoded.
     """
 
     session: Session
@@ -307,9 +309,10 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
 class Settled(NamedTuple):
     """A repaired session and its estimate, which no hypothesis explains better.
 
-    stated : the estimate with the readings' noise as stated. repairs : that were made, the data
-    otherwise than stated. findings : on repairs, on hypotheses that are likely but not decided for,
-    and on those that could not be tested.
+    stated : the estimate with the readings' noise as stated.
+    repairs : that were made, the data otherwise than stated.
+    findings : on repairs, on hypotheses that are likely but not decided for, and on those that
+        could not be tested.
     """
 
     case: Case

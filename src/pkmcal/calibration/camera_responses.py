@@ -124,9 +124,10 @@ def responses_by_edges(
     decide. The evidence is the gain of chi2 by the change to the other response, less that of the
     change back.
 
-    measurements, estimate : by the usual responses. roughly, measured : edges of images, searched
-    where those of ``measurements`` were, with the same blur or with their own. of_edges :
-    measurements with these edges instead.
+    measurements, estimate : by the usual responses.
+    roughly, measured : edges of images, searched where those of ``measurements`` were, with the
+        same blur or with their own.
+    of_edges : measurements with these edges instead.
     """
     usual: dict[_Camera, list[StationImages]] = {}
     for p in images:

@@ -78,12 +78,15 @@ class BedSurface:
 class ModelError:
     """A component of the discrepancy that the data show.
 
-    code : such as readings.workspace. scale : its standard deviation, m or rad of what it acts on.
-    unit : m or rad. ratio : twice the logarithm of the likelihood ratio. tool, tool_before : m,
-    standard deviation of the platform's position, root mean square over the session's poses, with
-    all components and without any. sure : whether it is named, or only contained in the covariance,
-    for larger noise of the readings or poses explains the data as well. length : correlation
-    length, m, and surface : the map, of a bed; None of all else.
+    code : such as readings.workspace.
+    scale : its standard deviation, m or rad of what it acts on.
+    unit : m or rad.
+    ratio : twice the logarithm of the likelihood ratio.
+    tool, tool_before : m, standard deviation of the platform's position, root mean square over the
+        session's poses, with all components and without any.
+    sure : whether it is named, or only contained in the covariance, for larger noise of the
+        readings or poses explains the data as well.
+    length : correlation length, m, and surface : the map, of a bed; None of all else.
     """
 
     code: str
@@ -401,8 +404,9 @@ def model_errors(
 ) -> tuple[ModelError, ...]:
     """The components found, with what they make of the tool's standard deviation.
 
-    tool, before : with the discrepancy and without. unit : of the readings. surface : of the bed,
-    where it is among them.
+    tool, before : with the discrepancy and without.
+    unit : of the readings.
+    surface : of the bed, where it is among them.
     """
     with_, without = (float(np.sqrt(np.nanmean(x.position**2))) for x in (tool, before))
     return tuple(

@@ -241,11 +241,13 @@ def localize_by_legs(
 ) -> LegLocalization:
     """Localize every station that observes legs; nothing is raised.
 
-    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``images``.
+    poses : T_base_platform (K, 4, 4) of the configurations.
+    rngs : one for each of ``images``.
     boards : on the base, give stations without a pose by hand a start, from those that were
-    localized. starts : (S, 4, 4) of all stations, where there are better starts than by hand; NaN
-    elsewhere. A station that is not recognised from its start is searched anywhere. For stations
-    with many images some are used, spread over all.
+        localized.
+    starts : (S, 4, 4) of all stations, where there are better starts than by hand; NaN elsewhere. A
+        station that is not recognised from its start is searched anywhere. For stations with many
+        images some are used, spread over all.
     """
     boards = boards or Boards()
     machine = session.machine
@@ -370,9 +372,10 @@ def frozen_in(session: Session) -> InputError | None:
 class StationSearch(NamedTuple):
     """Poses of all stations.
 
-    recognition : in the images that were searched, None where none were. T_camera_base : (S, 4, 4),
-    NaN for hand-held images that are not placed yet. error : why another station has no pose, or
-    which mistake explains its images; poses are then incomplete.
+    recognition : in the images that were searched, None where none were.
+    T_camera_base : (S, 4, 4), NaN for hand-held images that are not placed yet.
+    error : why another station has no pose, or which mistake explains its images; poses are then
+        incomplete.
     """
 
     leg_localization: LegLocalization | None

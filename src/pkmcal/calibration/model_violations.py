@@ -55,9 +55,11 @@ class DetectedViolation:
     """A model violation that the data show.
 
     finding : for the verdict, a reason where it shifts the tool by more than MOST_TOOL_SHIFT.
-    value, sigma : (k,) estimates of its numbers, all that were found free together. tool : by how
-    many of its standard deviations the platform's position moves if it is taken up, root mean
-    square over the session's poses. shift : the same in m. kind : word for calibration.json.
+    value, sigma : (k,) estimates of its numbers, all that were found free together.
+    tool : by how many of its standard deviations the platform's position moves if it is taken up,
+        root mean square over the session's poses.
+    shift : the same in m.
+    kind : word for calibration.json.
     """
 
     finding: Finding
@@ -102,9 +104,10 @@ class DetectedViolation:
 class ModelViolations(NamedTuple):
     """Deviations of the data from the model.
 
-    violations : named violations, the smallest p-value first. errors : components of the model
-    discrepancy beside them. estimate : whose covariance contains the discrepancy. random : the
-    discrepancy's columns.
+    violations : named violations, the smallest p-value first.
+    errors : components of the model discrepancy beside them.
+    estimate : whose covariance contains the discrepancy.
+    random : the discrepancy's columns.
     """
 
     violations: tuple[DetectedViolation, ...]

@@ -43,8 +43,9 @@ from pkmcal.wording import listed
 class MeasuredPlatforms(NamedTuple):
     """Platform poses by n measured poses.
 
-    configuration : (n,). T_base_platform : (n, 4, 4). noise : covariance (n, m, m) of the readings
-    that follow from each pose by inverse kinematics.
+    configuration : (n,).
+    T_base_platform : (n, 4, 4).
+    noise : covariance (n, m, m) of the readings that follow from each pose by inverse kinematics.
     """
 
     machine: Machine

@@ -105,10 +105,12 @@ PoseHypothesis = Hypothesis[PoseCase]
 class Diagnosis(NamedTuple):
     """Decision between the hypotheses about measured poses.
 
-    hypothesis : the mistake; None if no hypothesis explains the poses. log_odds : of the mistake,
-    nats. misfit : rms residual of the poses without the mistake, in stated standard deviations.
+    hypothesis : the mistake; None if no hypothesis explains the poses.
+    log_odds : of the mistake, nats.
+    misfit : rms residual of the poses without the mistake, in stated standard deviations.
     movement : (6,) left perturbation (omega, tau) of a board, or a station, that moved; NaN where
-    the data do not determine it. untested : codes and errors of hypotheses without an estimate.
+        the data do not determine it.
+    untested : codes and errors of hypotheses without an estimate.
     rivals : other mistakes that are not excluded.
     """
 
@@ -123,10 +125,14 @@ class Diagnosis(NamedTuple):
 class PoseEvidence:
     """Levels of evidence for the mistakes of one machine's measured poses.
 
-    machine : nominal. null_misfit : of the poses as stated, by an estimate. closure_unit : misfit
-    by closure that nominal errors of the prior's size cause, in stated standard deviations. most :
-    configurations that closure compares; all, if None. estimates, misfits, ratios : by an estimate
-    and by closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
+    machine : nominal.
+    null_misfit : of the poses as stated, by an estimate.
+    closure_unit : misfit by closure that nominal errors of the prior's size cause, in stated
+        standard deviations.
+    most : configurations that closure compares; all, if None.
+    estimates, misfits, ratios : by an estimate and by closure, of the hypotheses so far, by
+        identity.
+    untested : see :class:`Diagnosis`.
     """
 
     def __init__(
@@ -275,8 +281,10 @@ def diagnose(
 ) -> Diagnosis:
     """Mistake by which poses disagree with the machine, by closure and estimates.
 
-    machine : nominal. estimate : of these measurements. richer_misfit : of the poses by another
-    model of the mechanism file, in stated sigmas: a mistake has to explain more than that model.
+    machine : nominal.
+    estimate : of these measurements.
+    richer_misfit : of the poses by another model of the mechanism file, in stated sigmas: a mistake
+        has to explain more than that model.
     """
     if not np.any(measurements.on_platform[measurements.poses.mount]):
         return Diagnosis()  # poses of boards on the base alone
@@ -403,7 +411,9 @@ def _laid(body: Array, observed: Array, whiten: Array) -> Array:
     """Mean squares (N, n) of the whitened residuals of N runs of n poses of one station and mount,
     by the closed form that leaves least.
 
-    body : T_base_platform (N, n, 4, 4). observed : T_station_target. whiten : (n, 6, 6).
+    body : T_base_platform (N, n, 4, 4).
+    observed : T_station_target.
+    whiten : (n, 6, 6).
     """
     squares: list[Array] = []
     for pair in closed_forms(body, observed):

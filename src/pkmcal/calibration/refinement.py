@@ -115,10 +115,13 @@ _POINT_OFF = "the measurement lies {:.0f} standard deviations from where all oth
 class RefinementResult(NamedTuple):
     """Estimate of the last measurement pass, with its inputs.
 
-    images : as they were measured, with their binning. blur : of their edges, px, by station.
-    scatter : of coarse edges, see :class:`PriorScene`. start : initial state of the last estimate.
+    images : as they were measured, with their binning.
+    blur : of their edges, px, by station.
+    scatter : of coarse edges, see :class:`PriorScene`.
+    start : initial state of the last estimate.
     change : of the machine by the last pass, in its standard deviations, as
-    ``RefinementOptions.settled_change``. failures : why imputations gave no estimate.
+        ``RefinementOptions.settled_change``.
+    failures : why imputations gave no estimate.
     """
 
     observation: Observation

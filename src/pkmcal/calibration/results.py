@@ -156,9 +156,10 @@ def calibration_document(
 ) -> dict[str, Any]:
     """The content of calibration.json, plain data without NaN and dates.
 
-    not_identified : sentences about unidentifiable directions, as in the report. holdout :
-    residuals of held-out configurations, beside those in use. over : the tool over the workspace,
-    or why there is no map of it. images : digests of the images, computed unless given.
+    not_identified : sentences about unidentifiable directions, as in the report.
+    holdout : residuals of held-out configurations, beside those in use.
+    over : the tool over the workspace, or why there is no map of it.
+    images : digests of the images, computed unless given.
     """
     session, estimate = calibration.session, calibration.estimate
     bed = calibration.identification.bed

@@ -45,8 +45,9 @@ def explain_radii(
     """Diameters for radii, where edges disagree with the machine and more edges agree with half of
     the radii.
 
-    turns : refinement with the stated radii, None without an estimate. refine_camera : whether the
-    cameras are estimated. seed : for the localization of the stations.
+    turns : refinement with the stated radii, None without an estimate.
+    refine_camera : whether the cameras are estimated.
+    seed : for the localization of the stations.
     """
     null = _edge_misfit(turns)
     # errors of an imperfect model vary smoothly, so no more are independent than it has parameters

@@ -186,8 +186,9 @@ def _decode_images(session: Session) -> tuple[list[StationImages | None], list[F
 class _NominalKinematics:
     """Kinematics of the nominal machine at the readings.
 
-    poses : T_base_platform (K, 4, 4), None if the closure fails at some readings. singularity :
-    least over the configurations. assemblies : number of assembly modes at the first readings.
+    poses : T_base_platform (K, 4, 4), None if the closure fails at some readings.
+    singularity : least over the configurations.
+    assemblies : number of assembly modes at the first readings.
     """
 
     poses: Array | None

@@ -15,9 +15,11 @@ from pkmcal.session.load import Session
 class StationInspection:
     """Station in whose images the machine was searched for.
 
-    name : of the station. images : decoded images; ``station_images.station`` is the station's
-    number. by_hand : T_camera_base (4, 4) of the session, None without one. T_camera_base : (4, 4)
-    end of the search. quality : of the legs, None if the machine was not recognized.
+    name : of the station.
+    images : decoded images; ``station_images.station`` is the station's number.
+    by_hand : T_camera_base (4, 4) of the session, None without one.
+    T_camera_base : (4, 4) end of the search.
+    quality : of the legs, None if the machine was not recognized.
     """
 
     name: str

@@ -130,7 +130,9 @@ RUN_ENDS = tuple(End)
 class Stillness:
     """Noise of one image as a displacement of the platform, RMS over images for each goal.
 
-    joints : (R,) m, over the platform's joints. position : (R,) m, of their mean. turn : (R,) rad.
+    joints : (R,) m, over the platform's joints.
+    position : (R,) m, of their mean.
+    turn : (R,) rad.
     """
 
     joints: Array
@@ -195,10 +197,14 @@ def one_image(
 class LoopSettings:
     """Settings of a controller.
 
-    gain : 1/s. rate : samples per second. delay : samples from the exposure to the motors'
-    response. noise : of the edges, px. joint_noise : of a reading, m or rad. speed : (m,) largest
-    velocities of the motors, which are scaled together. duration : s. at : where the interaction
-    matrix is evaluated.
+    gain : 1/s.
+    rate : samples per second.
+    delay : samples from the exposure to the motors' response.
+    noise : of the edges, px.
+    joint_noise : of a reading, m or rad.
+    speed : (m,) largest velocities of the motors, which are scaled together.
+    duration : s.
+    at : where the interaction matrix is evaluated.
     """
 
     law: str = "edges"
@@ -221,10 +227,15 @@ class LoopSettings:
 class ServoRuns:
     """R runs of K samples.
 
-    time : (K,) s. error : (R, K) norm of e. travel : (R, K) RMS distance of the platform's joints
-    from the goal, m. past : (R, K) share of the path by which they are beyond the goal.
-    T_base_platform : (R, K, 4, 4). readings : (R, K, m). end : R ends. last : (R,) sample at which
-    a run was stopped; later samples repeat it. goals : (R, 4, 4).
+    time : (K,) s.
+    error : (R, K) norm of e.
+    travel : (R, K) RMS distance of the platform's joints from the goal, m.
+    past : (R, K) share of the path by which they are beyond the goal.
+    T_base_platform : (R, K, 4, 4).
+    readings : (R, K, m).
+    end : R ends.
+    last : (R,) sample at which a run was stopped; later samples repeat it.
+    goals : (R, 4, 4).
     """
 
     time: Array
@@ -287,7 +298,8 @@ def simulate_servo_runs(
 class _Now:
     """State of all runs at one sample.
 
-    sign : (R,) of the start's assembly mode. end : (R,) index into ``RUN_ENDS``, -1 for running.
+    sign : (R,) of the start's assembly mode.
+    end : (R,) index into ``RUN_ENDS``, -1 for running.
     last : (R,) sample of the end.
     """
 

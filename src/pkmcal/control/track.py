@@ -58,10 +58,12 @@ SEARCH_ROUNDS = 3
 class LegLines:
     """Seen legs as two edges each, of the radius that the controller uses; camera frame.
 
-    normal : (L, 2, 3) unit, NaN where the leg was not found. basis : (L, 2, 3, 2) tangent bases,
-    shift first. joint : (L, 4, 4) covariance in these bases, rad^2, side 0 before side 1; the edges
-    are correlated, because the distance of a leg turns both against each other. agrees : (L,)
-    whether the edges fit one leg. valid : (L,) whether edges of both sides were measured and agree.
+    normal : (L, 2, 3) unit, NaN where the leg was not found.
+    basis : (L, 2, 3, 2) tangent bases, shift first.
+    joint : (L, 4, 4) covariance in these bases, rad^2, side 0 before side 1; the edges are
+        correlated, because the distance of a leg turns both against each other.
+    agrees : (L,) whether the edges fit one leg.
+    valid : (L,) whether edges of both sides were measured and agree.
     """
 
     normal: Array
@@ -84,11 +86,13 @@ class LegLines:
 class EdgeMisfits:
     """Misfits of an image's edges at the predicted pose; M edges of s seen legs.
 
-    leg : (M,) index of the edge's leg among the seen ones. misfit : (M, 2) rotation from the
-    predicted plane to the measured one, in the edge's basis. by_a, by_b : (M, 2, 3) derivatives of
-    the predicted plane by the leg's ends, camera frame. information : (M, 2, 2). side : (M,).
-    closure : of the machine at the predicted pose. a, b : (s, 3) ends of the seen legs, camera
-    frame.
+    leg : (M,) index of the edge's leg among the seen ones.
+    misfit : (M, 2) rotation from the predicted plane to the measured one, in the edge's basis.
+    by_a, by_b : (M, 2, 3) derivatives of the predicted plane by the leg's ends, camera frame.
+    information : (M, 2, 2).
+    side : (M,).
+    closure : of the machine at the predicted pose.
+    a, b : (s, 3) ends of the seen legs, camera frame.
     """
 
     leg: Integers
@@ -284,9 +288,11 @@ class Sight:
 class TrackState:
     """State of the tracker between two images.
 
-    T_base_platform : (4, 4) pose from the readings. correction : (6,) left perturbation from that
-    pose to the edges'. valid : (L,) seen legs that were found. blur : px, NaN before any leg was
-    found. searched : whether the last image needed a wide search.
+    T_base_platform : (4, 4) pose from the readings.
+    correction : (6,) left perturbation from that pose to the edges'.
+    valid : (L,) seen legs that were found.
+    blur : px, NaN before any leg was found.
+    searched : whether the last image needed a wide search.
     """
 
     T_base_platform: Array
@@ -300,10 +306,13 @@ class TrackState:
 class TrackedLegs:
     """Seen legs in one image; L seen legs, camera frame.
 
-    lines : normals (L, 2, 3) with tangent bases and covariances, NaN where lost. valid : (L,).
-    reasons : (L,) why a leg is lost, "" otherwise. T_base_platform : (4, 4) pose from the edges,
-    near the pose from the readings. closed : False if no pose fits the readings. beside : m,
-    largest error of a rod's length at this pose, from late readings or those of another image.
+    lines : normals (L, 2, 3) with tangent bases and covariances, NaN where lost.
+    valid : (L,).
+    reasons : (L,) why a leg is lost, "" otherwise.
+    T_base_platform : (4, 4) pose from the edges, near the pose from the readings.
+    closed : False if no pose fits the readings.
+    beside : m, largest error of a rod's length at this pose, from late readings or those of another
+        image.
     state : for the next image.
     """
 

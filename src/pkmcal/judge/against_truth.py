@@ -24,8 +24,9 @@ class Errors:
     """Errors of a machine with respect to the true one, after registration of the frames: m and
     rad.
 
-    centre : mean distance of the joint centres. offset : root mean square. position, orientation :
-    mean error of the platform's pose at the session's readings.
+    centre : mean distance of the joint centres.
+    offset : root mean square.
+    position, orientation : mean error of the platform's pose at the session's readings.
     """
 
     centre: float

@@ -44,10 +44,12 @@ class ComparedCamera:
 class CameraDifference:
     """Difference between two cameras.
 
-    rotation : (3, 3) of A's rays into B's frame. pixels : (rows, columns, 2) of A, middles of
-    cells. difference : (rows, columns, 2) px, B's pixel minus A's; NaN where one has no ray. sigma
-    : (rows, columns) px, of the difference by chance in the worst direction; None if neither file
-    has a covariance. chance : p-value of as large a difference; None without sigma.
+    rotation : (3, 3) of A's rays into B's frame.
+    pixels : (rows, columns, 2) of A, middles of cells.
+    difference : (rows, columns, 2) px, B's pixel minus A's; NaN where one has no ray.
+    sigma : (rows, columns) px, of the difference by chance in the worst direction; None if neither
+        file has a covariance.
+    chance : p-value of as large a difference; None without sigma.
     """
 
     a: ComparedCamera

@@ -33,11 +33,14 @@ class Cause:
     """Possible change of the machine or its cameras.
 
     part : of a leg (:class:`~pkmcal.mechanisms.ParameterTable`), or ``all``, ``scale``, ``camera``,
-    ``station``. columns : (P, k), change of the machine's parameters (m, rad) by k numbers; or (P +
-    C, k), with the cameras' magnifications; or for all columns of
-    :class:`~pkmcal.judge.fixed_machine.Evidence`. sizes : (k,) their typical values: a prior sigma,
-    USUAL_RATIO_CHANGE, or USUAL_STATION_MOVE. legs : from 0. unit : of the k numbers: m, rad, or
-    empty for a ratio. camera, station : indices in the session.
+        ``station``.
+    columns : (P, k), change of the machine's parameters (m, rad) by k numbers; or (P + C, k), with
+        the cameras' magnifications; or for all columns of
+        :class:`~pkmcal.judge.fixed_machine.Evidence`.
+    sizes : (k,) their typical values: a prior sigma, USUAL_RATIO_CHANGE, or USUAL_STATION_MOVE.
+    legs : from 0.
+    unit : of the k numbers: m, rad, or empty for a ratio.
+    camera, station : indices in the session.
     """
 
     part: str

@@ -198,11 +198,14 @@ def detectable_range(
 class LegTest:
     """Tests of one leg, or of the legs of one motor.
 
-    legs : from 0. whole : test of all parameters except those of the tubes. zero : test of the
-    reading's zero, change : its estimate, if nothing else has changed; None for a leg without a
-    reading. unit, tolerance : of that zero. detects_zero : smallest change of it (m or rad) that is
-    detected with DETECTION_POWER. detects_base, detects_platform : the same for the joints (m), in
-    the most and the least observable direction.
+    legs : from 0.
+    whole : test of all parameters except those of the tubes.
+    zero : test of the reading's zero, change : its estimate, if nothing else has changed; None for
+        a leg without a reading.
+    unit, tolerance : of that zero.
+    detects_zero : smallest change of it (m or rad) that is detected with DETECTION_POWER.
+    detects_base, detects_platform : the same for the joints (m), in the most and the least
+        observable direction.
     """
 
     legs: tuple[int, ...]
@@ -295,11 +298,14 @@ class Explanation:
 class ChangeTests:
     """All tests for a change.
 
-    machine : of the numbers of all legs together. scale : of a common scale of all lengths.
-    stations : of each camera that is assumed to be unmoved. alpha : false-alarm rate of all tests
-    together. level : of a single test, for that rate. rest : ``machine`` without what the findings
-    explain. another_machine : whether a change of all numbers, of their tolerances' size, makes the
-    data a hundred times as likely as a few causes do; these are then not among the findings.
+    machine : of the numbers of all legs together.
+    scale : of a common scale of all lengths.
+    stations : of each camera that is assumed to be unmoved.
+    alpha : false-alarm rate of all tests together.
+    level : of a single test, for that rate.
+    rest : ``machine`` without what the findings explain.
+    another_machine : whether a change of all numbers, of their tolerances' size, makes the data a
+        hundred times as likely as a few causes do; these are then not among the findings.
     """
 
     legs: tuple[LegTest, ...]

@@ -45,12 +45,15 @@ class Ratio:
 class Promise:
     """Test of residuals against the standard deviations by calibration and images.
 
-    chi2, dof, chance : of all residuals. factor : root mean square ratio of residuals to standard
-    deviations. common : (m,) common offset of each reading in all configurations, m or rad.
-    common_sigma : (m,) its standard deviation. common_chance : p-value of all offsets being zero.
+    chi2, dof, chance : of all residuals.
+    factor : root mean square ratio of residuals to standard deviations.
+    common : (m,) common offset of each reading in all configurations, m or rad.
+    common_sigma : (m,) its standard deviation.
+    common_chance : p-value of all offsets being zero.
     usual, steady : whether the residuals, and their common offsets, agree with the standard
-    deviations times NOISE_EXCESS. expected : (n, m) standard deviations of the
-    residuals, m or rad. by_noise : (n, m) those by the noise of images and readings alone.
+        deviations times NOISE_EXCESS.
+    expected : (n, m) standard deviations of the residuals, m or rad.
+    by_noise : (n, m) those by the noise of images and readings alone.
     """
 
     chi2: float
@@ -94,11 +97,14 @@ class WeighedErrors:
 class NominalComparison:
     """Calibrated and nominal machine compared on n configurations.
 
-    rows : (n,) their indices. calibrated, nominal : errors of both machines. before, after : (n,)
-    root mean squares of each configuration's residuals by the nominal and by the calibrated
-    machine, weighted by their observability in the images (:class:`Weights`), m or rad. floor :
-    expected value by the noise of the images alone. ratio : of before to after. promise : test of
-    the residuals.
+    rows : (n,) their indices.
+    calibrated, nominal : errors of both machines.
+    before, after : (n,) root mean squares of each configuration's residuals by the nominal and by
+        the calibrated machine, weighted by their observability in the images (:class:`Weights`), m
+        or rad.
+    floor : expected value by the noise of the images alone.
+    ratio : of before to after.
+    promise : test of the residuals.
     """
 
     rows: Integers

@@ -49,10 +49,10 @@ UNSCALED_NOISE = RowGroups(1.0, 1.0, 1.0)
 class Trust:
     """Weights and noise of new data.
 
-    robust : IRLS weights (N,) of each kind. scale, readings : factors on the stated noise of each
-    kind and of readings. shading : px, its standard deviation. Weights come from an estimate with a
-    free machine: with a fixed one, a leg that has changed would be taken for errors of its edges,
-    and rejected.
+    robust : IRLS weights (N,) of each kind.
+    scale, readings : factors on the stated noise of each kind and of readings.
+    shading : px, its standard deviation. Weights come from an estimate with a free machine: with a
+        fixed one, a leg that has changed would be taken for errors of its edges, and rejected.
     """
 
     robust: RowGroups[Array]
@@ -103,9 +103,11 @@ class Trust:
 class Held:
     """Fit of new measurements with a fixed machine; see the module.
 
-    machine : with the tubes' radii estimated, if they were free. observed : (K,). problem, state :
-    with the final weights, and the solution. unknowns : names of the unknowns of a change: the
-    machine's parameters, and, as intrinsics, the cameras' magnifications.
+    machine : with the tubes' radii estimated, if they were free.
+    observed : (K,).
+    problem, state : with the final weights, and the solution.
+    unknowns : names of the unknowns of a change: the machine's parameters, and, as intrinsics, the
+        cameras' magnifications.
     """
 
     machine: Machine
@@ -158,11 +160,13 @@ def hold(
 ) -> Held:
     """Estimate poses, stations and boards with the machine fixed.
 
-    start : stations, mounts and poses in frames near those of the machine. data_weights : weights
-    and noise of the data; without it they are estimated, as well as the tubes' radii. magnified :
-    the measurements with an unknown magnification for each camera
-    (:func:`~pkmcal.judge.causes.magnified`), to separate it from a change of the machine. Raises
-    ResultError if the poses are not found.
+    start : stations, mounts and poses in frames near those of the machine.
+    data_weights : weights and noise of the data; without it they are estimated, as well as the
+        tubes' radii.
+    magnified : the measurements with an unknown magnification for each camera
+        (:func:`~pkmcal.judge.causes.magnified`), to separate it from a change of the machine.
+
+    Raises ResultError if the poses are not found.
     """
     still = held_machine(machine, radii=data_weights is None)
     shading = SHADING_SIGMA if data_weights is None else data_weights.shading
@@ -232,11 +236,12 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
 class Evidence:
     """Linear regression of new data on a change of the machine, ``w = X c + noise``.
 
-    w : (n,) of unit variance. by : X (n, P + C + 6 k), for the parameters' changes in m and rad,
-    the magnification of C cameras if requested, and the motion (phi, s) of k cameras that were left
-    in place, along their own axes, rad and m. The length of an axis is projected out of X.
+    w : (n,) of unit variance.
+    by : X (n, P + C + 6 k), for the parameters' changes in m and rad, the magnification of C
+        cameras if requested, and the motion (phi, s) of k cameras that were left in place, along
+        their own axes, rad and m. The length of an axis is projected out of X.
     fixed_stations : (k,) indices of these stations in the session. Every test for a change is a
-    score test on w and X, without an estimate of the machine.
+        score test on w and X, without an estimate of the machine.
     """
 
     w: Array

@@ -41,9 +41,10 @@ from pkmcal.solver.ranks import numerical_rank
 class MachineChange:
     """Machine b less machine a, in a's frames aligned so that they differ least.
 
-    machine : a with b's values in these frames. change : (P,) of the parameters, m and rad.
-    covariance : (P, P) of that by chance alone; zeros between nominal models. chi2, dof : of all
-    that the data tell of the change; dof is 0 between nominal models.
+    machine : a with b's values in these frames.
+    change : (P,) of the parameters, m and rad.
+    covariance : (P, P) of that by chance alone; zeros between nominal models.
+    chi2, dof : of all that the data tell of the change; dof is 0 between nominal models.
     """
 
     machine: Machine

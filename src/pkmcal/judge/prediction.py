@@ -66,11 +66,13 @@ class ReadingErrors:
 class Prediction:
     """Prediction of a session by a machine; values are NaN for configurations without observations.
 
-    machine : fixed, with the session's tube radii. observed : (K,) configurations with an observed
-    pose. T_base_platform : (K, 4, 4) observed, without the configuration's own readings. errors :
-    (K,) of the readings predicted from it, and of the tool point. noise : (n, n) covariance by the
-    noise of images and readings of the residuals of the n = K' m observed readings. by_machine :
-    (n, P) their derivatives by the machine's parameters.
+    machine : fixed, with the session's tube radii.
+    observed : (K,) configurations with an observed pose.
+    T_base_platform : (K, 4, 4) observed, without the configuration's own readings.
+    errors : (K,) of the readings predicted from it, and of the tool point.
+    noise : (n, n) covariance by the noise of images and readings of the residuals of the n = K' m
+        observed readings.
+    by_machine : (n, P) their derivatives by the machine's parameters.
     """
 
     machine: Machine

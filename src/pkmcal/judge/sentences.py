@@ -246,9 +246,10 @@ class Names:
 class ComparedSession:
     """Facts of a session for a verdict, besides the tests.
 
-    configurations : (K,) names. calibrated, observed : (K,) used by the calibration, and observed.
-    noisier : ratio to the calibration's factor on the stated noise of edges. stations_moved :
-    cameras that were assumed to be unmoved.
+    configurations : (K,) names.
+    calibrated, observed : (K,) used by the calibration, and observed.
+    noisier : ratio to the calibration's factor on the stated noise of edges.
+    stations_moved : cameras that were assumed to be unmoved.
     """
 
     configurations: tuple[str, ...]

@@ -47,11 +47,14 @@ NOT_INDEPENDENT = (
 class Validation:
     """Results of a validation.
 
-    calibration : as loaded. judged : comparison on configurations that it did not use; None without
-    any, when only regions were held out. remeasured : the new data's measurements, with an estimate
-    of their own. calibrated : (K,) configurations that it used. repeated :
-    (K,) new measurements at poses that it used. regions : holdouts within the session. paths :
-    straight paths.
+    calibration : as loaded.
+    judged : comparison on configurations that it did not use; None without any, when only regions
+        were held out.
+    remeasured : the new data's measurements, with an estimate of their own.
+    calibrated : (K,) configurations that it used.
+    repeated : (K,) new measurements at poses that it used.
+    regions : holdouts within the session.
+    paths : straight paths.
     """
 
     calibration: SavedCalibration
@@ -97,10 +100,13 @@ def validate_calibration(
 ) -> Validation:
     """Errors of a calibration on a session that it did not use, without writing files.
 
-    calibration : its folder, or as loaded. session : a loaded session, or its folder. regions :
-    number of regions of the session's workspace that are held out in addition, one after the other,
-    from a calibration on the rest; the session may then be that of the calibration. seed : of the
-    localization. Raises InputError if the two do not belong together.
+    calibration : its folder, or as loaded.
+    session : a loaded session, or its folder.
+    regions : number of regions of the session's workspace that are held out in addition, one after
+        the other, from a calibration on the rest; the session may then be that of the calibration.
+    seed : of the localization.
+
+    Raises InputError if the two do not belong together.
     """
     from threadpoolctl import threadpool_limits
 

@@ -49,12 +49,17 @@ NOTHING_NEW = (
 class Watch:
     """Results of the tests of a calibrated machine.
 
-    calibration : as loaded. judged : the tests. residuals : (K,) root mean squares of each
-    configuration's residuals with the fixed machine, in standard deviations. calibrated : (K,)
-    configurations used by the calibration, which are excluded. observed : (K,) those that are
-    tested. noise_scale, pose_scale : factors on the stated noise. same_place : stations with the
-    poses of the calibration. stations_moved : stations that should have them, and do not. run :
-    this test as an entry of the run chart. earlier : those before it.
+    calibration : as loaded.
+    judged : the tests.
+    residuals : (K,) root mean squares of each configuration's residuals with the fixed machine, in
+        standard deviations.
+    calibrated : (K,) configurations used by the calibration, which are excluded.
+    observed : (K,) those that are tested.
+    noise_scale, pose_scale : factors on the stated noise.
+    same_place : stations with the poses of the calibration.
+    stations_moved : stations that should have them, and do not.
+    run : this test as an entry of the run chart.
+    earlier : those before it.
     """
 
     calibration: SavedCalibration
@@ -114,11 +119,14 @@ def watch_machine(
 ) -> Watch:
     """Test a calibrated machine on new data, without writing files.
 
-    calibration : its folder, or as loaded. session : a loaded session, or its folder; a few
-    configurations are enough. alpha : false-alarm rate. seed : of the localization. same_place :
-    names of stations whose camera was not touched since the calibration; a station that has
-    evidently moved is localized anew and reported. Raises InputError if the two do not belong
-    together.
+    calibration : its folder, or as loaded.
+    session : a loaded session, or its folder; a few configurations are enough.
+    alpha : false-alarm rate.
+    seed : of the localization.
+    same_place : names of stations whose camera was not touched since the calibration; a station
+        that has evidently moved is localized anew and reported.
+
+    Raises InputError if the two do not belong together.
     """
     from threadpoolctl import threadpool_limits
 

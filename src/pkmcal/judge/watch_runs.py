@@ -39,7 +39,9 @@ def _iso_time(text: str) -> str:
 class LegRun(Schema):
     """Zero of a leg's reading in a run.
 
-    legs : from 1. unit : m or rad. value, sigma : change of the zero, if nothing else changed.
+    legs : from 1.
+    unit : m or rad.
+    value, sigma : change of the zero, if nothing else changed.
     limit : change beyond which its test fails.
     """
 
@@ -53,9 +55,13 @@ class LegRun(Schema):
 class Run(Schema):
     """One test of a calibrated machine.
 
-    time : of the test, local, ISO 8601. session : its name. digest : of its data. calibration :
-    digest of the calibrated machine. configurations : number of those tested. share : largest
-    statistic of all tests, relative to its threshold. zeros : of the legs that have one.
+    time : of the test, local, ISO 8601.
+    session : its name.
+    digest : of its data.
+    calibration : digest of the calibrated machine.
+    configurations : number of those tested.
+    share : largest statistic of all tests, relative to its threshold.
+    zeros : of the legs that have one.
     """
 
     time: Annotated[str, AfterValidator(_iso_time)]

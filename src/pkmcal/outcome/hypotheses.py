@@ -60,12 +60,14 @@ NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
 class Hypothesis(Generic[Data]):
     """Possible mistake in a session, as a transformation of its data.
 
-    code : of its finding, such as readings.exchanged. subject : the motor, station, file or image
-    concerned; hypotheses with one code and one subject are variants of one explanation. apply : the
-    data (of a session, of a station, of poses) as they would be without the mistake. log_prior :
-    prior log-odds, with the number of alternatives of the same kind and the cost of free parameters
-    (:func:`parameter_cost`). action : what follows where the hypothesis is decided for. facts : for
-    the finding, by name.
+    code : of its finding, such as readings.exchanged.
+    subject : the motor, station, file or image concerned; hypotheses with one code and one subject
+        are variants of one explanation.
+    apply : the data (of a session, of a station, of poses) as they would be without the mistake.
+    log_prior : prior log-odds, with the number of alternatives of the same kind and the cost of
+        free parameters (:func:`parameter_cost`).
+    action : what follows where the hypothesis is decided for.
+    facts : for the finding, by name.
     """
 
     code: str
@@ -85,8 +87,9 @@ class EvidenceLevel(NamedTuple, Generic[Subject]):
     """Evidence by which hypotheses are compared.
 
     log_likelihood_ratios : (N,) nats, of N hypotheses against the null; minus infinity for those
-    that are untenable. decides : whether the comparison may end here. most : hypotheses that go on
-    to the next level, without limit where None.
+        that are untenable.
+    decides : whether the comparison may end here.
+    most : hypotheses that go on to the next level, without limit where None.
     """
 
     name: str
@@ -105,8 +108,10 @@ def estimate_level(
     """Level of evidence by an estimate under each hypothesis.
 
     misfit : of the residuals without the mistake, as of :func:`log_likelihood`; raises one of
-    NO_ESTIMATE where there is none. null : misfit as stated. tenable : misfit from which a
-    hypothesis explains nothing. failed : called with hypotheses without an estimate, and why.
+        NO_ESTIMATE where there is none.
+    null : misfit as stated.
+    tenable : misfit from which a hypothesis explains nothing.
+    failed : called with hypotheses without an estimate, and why.
     """
 
     def ratios(hypotheses: Sequence[Subject]) -> Array:
@@ -133,8 +138,9 @@ class Ranked(NamedTuple, Generic[Subject]):
 class Explanation(NamedTuple):
     """Decision between the hypotheses about one kind of data.
 
-    error : names the mistake; None if no hypothesis is likely enough. log_odds : of the mistake,
-    nats. untested : notes on hypotheses that could not be tested.
+    error : names the mistake; None if no hypothesis is likely enough.
+    log_odds : of the mistake, nats.
+    untested : notes on hypotheses that could not be tested.
     """
 
     error: InputError | None = None

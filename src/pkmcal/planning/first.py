@@ -53,8 +53,10 @@ FIRST_EDGES_SEED = 7
 class EdgePool(NamedTuple):
     """Samples of the information of an edge.
 
-    information : (n, 2, 2), px^-2 of shift and tilt. weight : (n,). length : (n,) of the sampled
-    edges, px. shading : px, individual.
+    information : (n, 2, 2), px^-2 of shift and tilt.
+    weight : (n,).
+    length : (n,) of the sampled edges, px.
+    shading : px, individual.
     """
 
     information: Array
@@ -87,8 +89,9 @@ Pools = tuple[EdgePool, ...]
 class EdgesOf:
     """Edges (k, E) of a station's first images, in the order of ``tubes_of``.
 
-    images : (k,) numbers of the images. expected : edges whose larger part is visible. valid :
-    expected edges that were measured and are inliers.
+    images : (k,) numbers of the images.
+    expected : edges whose larger part is visible.
+    valid : expected edges that were measured and are inliers.
     """
 
     images: Integers
@@ -100,8 +103,9 @@ class EdgesOf:
 class FirstEdges:
     """Estimate by the first images.
 
-    estimate : by these images only. pools, edges : by station. sigma : (S, L) median standard
-    deviation of a leg's edges, px across.
+    estimate : by these images only.
+    pools, edges : by station.
+    sigma : (S, L) median standard deviation of a leg's edges, px across.
     """
 
     estimate: Estimate
@@ -134,9 +138,12 @@ def first_edges(
 ) -> FirstEdges:
     """Measure the edges of the first images, by a search and one measurement pass.
 
-    station_images : of S stations. rows : indices of the images to be measured, by station.
-    T_camera_base : (S, 4, 4) localized poses. poses : T_base_platform (K, 4, 4) by the nominal
-    model. Raises PkmcalError if there are too few edges for an estimate.
+    station_images : of S stations.
+    rows : indices of the images to be measured, by station.
+    T_camera_base : (S, 4, 4) localized poses.
+    poses : T_base_platform (K, 4, 4) by the nominal model.
+
+    Raises PkmcalError if there are too few edges for an estimate.
     """
     machine = session.machine
     numbers = numbered(session.camera_of_station[[p.station for p in station_images]])
@@ -244,9 +251,12 @@ def _pools(
 ) -> Pools:
     """Pools of a station's edges (E,): samples of the tube's own edge and of all edges of its kind.
 
-    values : (K, E, 2, 2) information, zero if lost. length : (K, E), px. expected : (K, E). kind :
-    (E, 2) tube and side. shading : (E,) px. Samples are kept, because a mean would predict more
-    than edges of which some have much information and others none.
+    values : (K, E, 2, 2) information, zero if lost.
+    length : (K, E), px.
+    expected : (K, E).
+    kind : (E, 2) tube and side.
+    shading : (E,) px. Samples are kept, because a mean would predict more than edges of which some
+        have much information and others none.
     """
     out: list[EdgePool] = []
     for e in range(values.shape[1]):

@@ -56,8 +56,10 @@ as the length of an axis.
 class Candidates:
     """Candidate measurements: n configurations, each measured by one of G groups of stations.
 
-    groups : stations that measure a configuration together. group : (n,) index of the group, in
-    increasing order. joints : (n, m). T_base_platform : (n, 4, 4).
+    groups : stations that measure a configuration together.
+    group : (n,) index of the group, in increasing order.
+    joints : (n, m).
+    T_base_platform : (n, 4, 4).
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -91,8 +93,9 @@ class Directions(NamedTuple):
     """Directions of the machine's free parameters z that gauge and conventions leave, in prior
     sigmas.
 
-    to_z : (nz, p). of_z : (p, nz) the inverse map. span : (nz, g) changes of z by gauge and
-    conventions.
+    to_z : (nz, p).
+    of_z : (p, nz) the inverse map.
+    span : (nz, g) changes of z by gauge and conventions.
     """
 
     to_z: Array
@@ -104,11 +107,14 @@ class Directions(NamedTuple):
 class CandidateRows:
     """Rows of all candidates, with the prior information.
 
-    rows : (n, r, na) on the shared unknowns in their own units. group : (n,) index of the group of
-    stations, in increasing order. where : (n, m) readings relative to the motors' ranges.
-    information : (na, na) prior information, with that of the nominal model. machine : (p, na)
-    directions of the machine; the nominal model alone gives each a variance of one. work : (M, 6,
-    p) turn and shift of the platform at M poses of the workspace by each direction, rad and m.
+    rows : (n, r, na) on the shared unknowns in their own units.
+    group : (n,) index of the group of stations, in increasing order.
+    where : (n, m) readings relative to the motors' ranges.
+    information : (na, na) prior information, with that of the nominal model.
+    machine : (p, na) directions of the machine; the nominal model alone gives each a variance of
+        one.
+    work : (M, 6, p) turn and shift of the platform at M poses of the workspace by each direction,
+        rad and m.
     """
 
     rows: Array
@@ -153,11 +159,13 @@ def information_of(
 ) -> CandidateRows:
     """Rows of all candidates.
 
-    work : T_base_platform (M, 4, 4) of the workspace. calibration_prior : prior of an earlier
-    calibration, in place of the nominal model. rng : as for
-    :meth:`~pkmcal.planning.rig.LegsFrom.measure`. wanted : number of each group that will be
-    measured, by default all: it determines the correlation of edges with common shading. Raises
-    InputError if a group of stations measures nothing in any configuration.
+    work : T_base_platform (M, 4, 4) of the workspace.
+    calibration_prior : prior of an earlier calibration, in place of the nominal model.
+    rng : as for :meth:`~pkmcal.planning.rig.LegsFrom.measure`.
+    wanted : number of each group that will be measured, by default all: it determines the
+        correlation of edges with common shading.
+
+    Raises InputError if a group of stations measures nothing in any configuration.
     """
     machine, joints, poses = rig.machine, candidates.joints, candidates.T_base_platform
     measurements = rig.measured(joints, poses, candidates.pairs, rng)

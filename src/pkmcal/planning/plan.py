@@ -96,15 +96,19 @@ class TriedStation:
 class MeasurementPlan:
     """Planned measurements, in the order of the path through them.
 
-    subject : subject of the plan, with the chosen stations if these were free. stations : (n,)
-    tuples of names of the stations that measure each configuration. names, joints (n, m),
-    T_base_platform (n, 4, 4) : the configurations; those of ``rank`` up to k are the best k at each
-    station. now, promised, by_chance :
-    accuracy before the plan, with it, and with random configurations. curve : accuracy with fewer
-    and with more configurations. region : the workspace, work : its poses. blocked : (n,) True if
-    the machine cannot take the straight path to a configuration, or its legs touch on it. travel :
-    total motion of the slowest motor, relative to its range, on the planned and on a random path.
-    tried : candidate stations. together : whether all stations measure each configuration.
+    subject : subject of the plan, with the chosen stations if these were free.
+    stations : (n,) tuples of names of the stations that measure each configuration.
+    names, joints (n, m), T_base_platform (n, 4, 4) : the configurations; those of ``rank`` up to k
+        are the best k at each station.
+    now, promised, by_chance : accuracy before the plan, with it, and with random configurations.
+    curve : accuracy with fewer and with more configurations.
+    region : the workspace, work : its poses.
+    blocked : (n,) True if the machine cannot take the straight path to a configuration, or its legs
+        touch on it.
+    travel : total motion of the slowest motor, relative to its range, on the planned and on a
+        random path.
+    tried : candidate stations.
+    together : whether all stations measure each configuration.
     """
 
     subject: Subject
@@ -152,13 +156,17 @@ def plan_measurements(
 ) -> MeasurementPlan:
     """Plan measurements for a subject.
 
-    count : configurations at each station; in total, if all stations measure together. region :
-    workspace in which the tool's accuracy counts; by default all reachable poses. together :
-    whether all stations measure every configuration; by default if they have cameras of their own
-    or there is a tracker. free_stations : number of stations to choose on a sphere around the
-    machine. best_of : number of the rig's stations to choose. seed : of all random numbers.
-    progress : callback with the share done. options : of the search. Raises InputError for what
-    cannot be planned.
+    count : configurations at each station; in total, if all stations measure together.
+    region : workspace in which the tool's accuracy counts; by default all reachable poses.
+    together : whether all stations measure every configuration; by default if they have cameras of
+        their own or there is a tracker.
+    free_stations : number of stations to choose on a sphere around the machine.
+    best_of : number of the rig's stations to choose.
+    seed : of all random numbers.
+    progress : callback with the share done.
+    options : of the search.
+
+    Raises InputError for what cannot be planned.
     """
     progress = progress or (lambda _share: None)
     rig, rng = subject.rig, np.random.default_rng(seed)

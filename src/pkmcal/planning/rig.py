@@ -89,7 +89,9 @@ class LegsFrom:
 class BoardFrom:
     """Board on the platform, observed by a camera at T_camera_base (4, 4).
 
-    points : (N, 3) corners, board frame, m. T_platform_board : (4, 4). sigma : of a corner, px.
+    points : (N, 3) corners, board frame, m.
+    T_platform_board : (4, 4).
+    sigma : of a corner, px.
     mount : its index.
     """
 
@@ -164,10 +166,14 @@ Instrument = LegsFrom | BoardFrom | TargetFrom
 class Rig:
     """Machine with its instruments.
 
-    names : of S stations. T_station_base : (S, 4, 4) of cameras and trackers. camera_of_station :
-    (S,) index of the camera. joint_noise : of a reading. mounts : of boards and targets, with poses
-    T_mount (M, 4, 4). shading : px, standard deviation of the shift that edges of one side of a
-    tube at one station share. where : prefix of a station's name in messages; None without a file.
+    names : of S stations.
+    T_station_base : (S, 4, 4) of cameras and trackers.
+    camera_of_station : (S,) index of the camera.
+    joint_noise : of a reading.
+    mounts : of boards and targets, with poses T_mount (M, 4, 4).
+    shading : px, standard deviation of the shift that edges of one side of a tube at one station
+        share.
+    where : prefix of a station's name in messages; None without a file.
     """
 
     machine: Machine

@@ -146,8 +146,10 @@ def lamp_visibility(
 class RayHits(NamedTuple):
     """First hits of rays, (bundles, rays) each.
 
-    light : radiance. label : integer that changes at every visible border; it encodes the shape,
-    its face, and whether the point is in shadow. visible : share of the lamp that the point sees.
+    light : radiance.
+    label : integer that changes at every visible border; it encodes the shape, its face, and
+        whether the point is in shadow.
+    visible : share of the lamp that the point sees.
     """
 
     light: Array
@@ -231,9 +233,11 @@ def _flat(rays: Array, rows: Integers) -> Array:
 class Sensor:
     """Lens blur and sensor.
 
-    blur : standard deviation of the point spread, px. exposure : grey levels for light 1.
-    read_noise : grey levels. shot_noise : variance for each grey level; the noise at level g has
-    the variance read_noise^2 + shot_noise g.
+    blur : standard deviation of the point spread, px.
+    exposure : grey levels for light 1.
+    read_noise : grey levels.
+    shot_noise : variance for each grey level; the noise at level g has the variance read_noise^2 +
+        shot_noise g.
     """
 
     blur: float = default("simulate", "blur")

@@ -93,7 +93,9 @@ class SimulatedSessions:
     """Batch of simulated sessions, ready to be calibrated.
 
     capture : their common plan. theta (B, P), poses T_base_platform (B, K, 4, 4), internal (B, K,
-    n) hinges : the truth. assembled : least-squares problem of all runs. start : initial state.
+        n) hinges : the truth.
+    assembled : least-squares problem of all runs.
+    start : initial state.
     """
 
     capture: Capture
@@ -264,10 +266,11 @@ def tool_error_and_sigma(
     """Errors of a calibrated machine's poses at given readings, and their stated standard
     deviations.
 
-    theta (P,), covariance (P, P) : of the result. joints : (W, m) readings. The frames of the truth
-    are registered to those of the result as in :func:`pkmcal.identify.tool.tool_error`; every : as
-    if no legs were observed. Returns two arrays (W, 6) of (omega, tau); NaN where a machine cannot
-    take the readings.
+    theta (P,), covariance (P, P) : of the result.
+    joints : (W, m) readings. The frames of the truth are registered to those of the result as in
+        :func:`pkmcal.identify.tool.tool_error`.
+    every : as if no legs were observed. Returns two arrays (W, 6) of (omega, tau); NaN where a
+        machine cannot take the readings.
     """
     n = len(theta)
     # register the truth to the result rather than to the nominal model
