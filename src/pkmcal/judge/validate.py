@@ -48,11 +48,11 @@ class Validation:
     """Results of a validation.
 
     calibration : as loaded.
-    judged : comparison on configurations that it did not use; None without any, when only regions
+    judged : comparison on configurations that the calibration did not use; None if only regions
         were held out.
-    remeasured : the new data's measurements, with an estimate of their own.
-    calibrated : (K,) configurations that it used.
-    repeated : (K,) new measurements at poses that it used.
+    remeasured : measurements of the new data, with an estimate of their own.
+    calibrated : (K,) configurations that the calibration used.
+    repeated : (K,) new measurements at poses that the calibration used.
     regions : holdouts within the session.
     paths : straight paths.
     """

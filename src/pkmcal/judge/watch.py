@@ -50,16 +50,16 @@ class Watch:
     """Results of the tests of a calibrated machine.
 
     calibration : as loaded.
-    judged : the tests.
+    judged : tests for a change.
     residuals : (K,) root mean squares of each configuration's residuals with the fixed machine, in
         standard deviations.
     calibrated : (K,) configurations used by the calibration, which are excluded.
-    observed : (K,) those that are tested.
+    observed : (K,) configurations that are tested.
     noise_scale, pose_scale : factors on the stated noise.
-    same_place : stations with the poses of the calibration.
-    stations_moved : stations that should have them, and do not.
+    same_place : stations that are assumed to have the poses of the calibration.
+    stations_moved : stations among these that have moved.
     run : this test as an entry of the run chart.
-    earlier : those before it.
+    earlier : earlier entries.
     """
 
     calibration: SavedCalibration
@@ -182,8 +182,8 @@ def watch_machine(
 
 
 def _reading_scale(saved: SavedCalibration, session: Session) -> float:
-    """Factor on the stated noise of readings found by the calibration, if the session states the
-    same noise; else 1.
+    """Factor on the stated noise of readings that the calibration estimated; 1 if the session
+    states another noise.
     """
     joints = (saved.document.get("session") or {}).get("joints") or {}
     statistics = saved.document.get("statistics") or {}
@@ -225,8 +225,7 @@ def _with_fixed_poses(
 def tests_with_fixed_stations(
     held: Held, prior: CalibrationPrior, alpha: float
 ) -> tuple[ChangeTests, CalibrationPrior, tuple[StationTest, ...]]:
-    """All tests, the prior with the stations that were kept for them, and the stations that have
-    moved.
+    """All tests, the prior with the stations that remain fixed, and the stations that have moved.
 
     If moved cameras explain the data better than any change of the machine, they are freed and the
     tests repeated; so the false-alarm rate remains alpha.

@@ -64,8 +64,8 @@ class Subject:
     """Subject of a plan.
 
     rig : machine and instruments.
-    prior : of an earlier calibration.
-    columns : of joints.csv.
+    prior : prior of an earlier calibration.
+    columns : columns of joints.csv.
     names : of existing configurations.
     words : sentences on the sources of its numbers.
     board : fields of the board's file, if a board is observed.
