@@ -1,8 +1,8 @@
 """Checks of a session before it is calibrated.
 
-All that `load_session` refuses, then what only images show: whether they can be decoded, are well
-exposed and sharp, and whether machine and boards are recognized in them; then what readings and
-measured poses show before a calibration.
+All checks of `load_session`; then checks of the images: whether they can be decoded, are well
+exposed and sharp, and whether machine and boards are localized in them; then checks of the readings
+and measured poses that do not need a calibration.
 """
 
 from __future__ import annotations
@@ -223,7 +223,10 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematic
 
 
 class _ImageChecks(NamedTuple):
-    """Results of the images. inspection : None if the machine could not be searched for."""
+    """Results of the checks of the images.
+
+    inspection : None if the machine could not be searched for.
+    """
 
     stations: tuple[StationCheck, ...]
     findings: tuple[Finding, ...]

@@ -41,12 +41,12 @@ class LegForecast:
 
     seen : share of its edges' points that are not hidden, in all images.
     found : share of the expected edges that were measured and are inliers, in the first images; NaN
-        without expected ones.
-    sigma : their median standard deviation, px across.
+        without expected edges.
+    sigma : median standard deviation of these edges, px across.
     tells : share of the information of all edges of the capture on the machine (in units of the
-        prior sigmas).
-    variance : share of the variance of the platform's position that comes from the errors of its
-        edges: a better view of a leg with a large share gains most.
+        prior sigmas) that is due to this leg.
+    variance : share of the variance of the platform's position due to the errors of its edges: a
+        better view of a leg with a large share improves the result most.
     """
 
     station: str

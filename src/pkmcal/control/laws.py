@@ -12,8 +12,8 @@ A_j(q_j), which covers cranks and sliders: with q' = D twist,
     du_j = (I - u u^T) / length (dB_j - dA_j),    dA_j = (dA_j / dq_j) D_j twist,
 
 which is [B] eq. 9 where dA_j / dq_j = 0. Machines with fewer than six degrees of freedom are
-restricted to the twists that they can make. The wanted values are measured as well (the machine was
-at the goal once), so errors of the controller's geometry change the path and not its end.
+restricted to the twists that they can make. The wanted values are measured too, in an image of the
+machine at the goal, so errors of the controller's geometry change the path but not its end.
 """
 
 from __future__ import annotations
@@ -326,9 +326,7 @@ def joint_velocities(
 
 
 def limited(speeds: Array, fastest: Array | float | None) -> Array:
-    """Velocities (..., m) with a common factor so that none exceeds its limit; the direction is
-    kept.
-    """
+    """Velocities (..., m) scaled by a common factor so that none exceeds its limit."""
     if fastest is None:
         return speeds
     with np.errstate(invalid="ignore"):

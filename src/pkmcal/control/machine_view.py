@@ -1,9 +1,9 @@
 """Machine in front of a camera, as a controller models it, and its legs at one moment.
 
 Visual servoing by the legs ([B] III) needs the points A_j and the rods' lengths, from the readings
-and the model, and the legs' measured directions. If every leg is seen and the platform is rigid,
-nothing else enters: B = A + length u, without the platform's geometry and without forward
-kinematics. Legs that are not seen, joint axes and articulated platforms need the pose from the
+and the model, and the legs' measured directions. If every leg is observed and the platform is
+rigid, that is sufficient: B = A + length u, without the platform's geometry and without forward
+kinematics. Legs that are not observed, joint axes and articulated platforms need the pose from the
 readings.
 
 A twist is (omega, tau) as in :mod:`pkmcal.geometry.rigid`, along the base frame's axes; tau is the

@@ -1,9 +1,9 @@
 """Study of visual servoing with different estimates of the geometry, [B] Fig. 10.
 
 Each estimate controls many runs of the simulated loop, and the visibility of the platform's motion
-is analysed. The estimates: E1, the nominal model fitted to the identified
-base centres ([B] eq. 15). E2, the identified geometry. E3, the nominal model with a hand-measured
-camera pose. The true geometry is the reference.
+is analysed. The estimates are E1, the nominal model fitted to the identified base centres ([B] eq.
+15); E2, the identified geometry; E3, the nominal model with a hand-measured camera pose. The true
+geometry is the reference.
 """
 
 from __future__ import annotations
@@ -166,8 +166,8 @@ class Plant:
 
     nominal : (P,) nominal values.
     uncertainty : of the calibration.
-    legs : seen legs, from 0; by default all with tubes.
-    origin : a sentence for people.
+    legs : observed legs, from 0; by default all with tubes.
+    origin : source of the plant, a sentence for people.
     station : the camera's station, None without a calibration.
     findings : findings on the source.
     """
@@ -193,7 +193,7 @@ class Trials:
     """Runs with one estimate of the geometry, and their figures.
 
     overshoot : (R,) largest distance beyond the goal, relative to the path's length.
-    rise : (R,) largest rise of the norm of e above an earlier value, relative to its start.
+    rise : (R,) largest increase of the norm of e above an earlier value, relative to its start.
     settling : (R,) s after which the platform stays within ARRIVED_DISTANCE_SHARE of its path, NaN
         for never.
     astray : (R,) m, largest RMS distance of the platform's joints from the path with the true
@@ -222,10 +222,10 @@ class Trials:
 class Study:
     """Results of a study.
 
-    outcomes : true, identified, cad, hand.
+    outcomes : runs with the estimates true, identified, cad and hand.
     image, held : noise at the goals, of one image and in the loop.
-    hidden : (s,) share of starts and goals at which a leg stands behind another.
-    visibility : of the platform's motion by the observed legs.
+    hidden : (s,) share of starts and goals at which a leg is behind another.
+    visibility : visibility of the platform's motion by the observed legs.
     """
 
     scene: Plant

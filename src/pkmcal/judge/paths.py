@@ -26,8 +26,8 @@ class LinePath:
 
     n : number of points.
     seen : straightness of the poses observed in the images; None with fewer than three points.
-    drawing, calibrated : straightness by forward kinematics of the readings, of the nominal and of the
-        calibrated machine; None if a machine does not close.
+    drawing, calibrated : straightness by forward kinematics of the readings, of the nominal and of
+        the calibrated machine; None if a machine does not close.
     """
 
     name: str

@@ -2,7 +2,7 @@
 
 Rays are cast in bundles of neighbours, (3, bundles, rays). A bundle lies in a narrow cone, and only
 shapes with a bounding ball in that cone are tested: the cost of a leg is proportional to its area
-in the image. The first hit is lit by the share of the lamp that the point sees.
+in the image. The first hit is lit by the share of the lamp that is visible from the point.
 
 Each pixel is sampled once through its centre. Where the label (shape, face, shadow) of a pixel
 differs from a neighbour's, the pixel is sampled again, so that its grey level is the mean over its
@@ -149,7 +149,7 @@ class RayHits(NamedTuple):
     light : radiance.
     label : integer that changes at every visible border; it encodes the shape, its face, and
         whether the point is in shadow.
-    visible : share of the lamp that the point sees.
+    visible : share of the lamp that is visible from the point.
     """
 
     light: Array

@@ -64,23 +64,23 @@ class RequestedConfigurations:
 class Settings:
     """Properties of a simulated session.
 
-    stations : their number, or their poses.
+    stations : number of stations, or their poses.
     configurations : number of images of each station.
-    shared : all stations see the same configurations; by default each has its own.
+    shared : whether all stations observe the same configurations; by default each has its own.
     tolerance : standard deviation of the true values about the nominal model, in prior sigmas.
     joint_noise : standard deviation of a reading, m.
     rough_position, rough_angle : errors of the session's station poses, m and rad.
     extreme : share of configurations with every leg near an end of its range, as far as there are
         that many different poses.
-    board : board that every station sees, fixed to ``board_on``.
-    observe : value of ``observe`` in session.yaml for stations that see a board.
+    board : board that every station observes, fixed to ``board_on``.
+    observe : value of ``observe`` in session.yaml for stations that observe a board.
     repeats : images of each configuration from each station, with independent sensor noise.
     shake : standard deviations (m, rad) of the camera's motion between repeats.
     finish, light : of the legs and of the room.
-    as_built : motors, rings and cables on the legs that are not in the nominal model.
-    asked : these configurations instead of random ones.
-    handheld : each image from a pose of its own about the machine, ``repeats`` of each
-        configuration, with focal lengths that vary by ``breathing``, one standard deviation;
+    as_built : whether legs have motors, rings and cables that are not in the nominal model.
+    asked : requested configurations, instead of random ones.
+    handheld : whether each image has a pose of its own around the machine, with ``repeats`` images
+        of each configuration and focal lengths with the relative standard deviation ``breathing``;
         ``stations`` is then ignored.
     """
 
@@ -122,12 +122,11 @@ class Truth:
     T_camera_base : (S, 4, 4).
     rough : station poses in session.yaml.
     T_base_platform : (K, 4, 4).
-    joints : (K, m) exact readings.
-    readings : (K, m) with noise.
+    joints, readings : (K, m) exact readings, and readings with noise.
     images : (M, 2) numbers of the station and the configuration of each image.
-    seed : seed of all random numbers.
+    seed : seed for all random numbers.
     T_base_board, T_platform_board : (4, 4) pose of the board, if any.
-    repeats : images of each pair.
+    repeats : number of images of each pair.
     focal_scale : (S,) factors on the camera's focal lengths, for hand-held images.
     """
 

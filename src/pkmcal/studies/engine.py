@@ -30,9 +30,9 @@ class StudyResult(Generic[S]):
 
     samples : of all runs, by key.
     accuracy : summaries of the quantities, each with its Monte-Carlo error.
-    wall : seconds of the whole study.
-    solving : seconds of the estimators alone, divided by the number of ``workers``.
-    cpu : processor seconds of the estimators.
+    wall : duration of the whole study, s.
+    solving : duration of the estimators alone, divided by the number of ``workers``, s.
+    cpu : processor time of the estimators, s.
     """
 
     setting: S
