@@ -1,10 +1,11 @@
 """Thermal growth of drives and frame, by the temperatures in the readings' table.
 
 With the temperature T of a configuration and its mean over the session, a length L of the machine
-is L (1 + g (T - mean)). Two coefficients g are estimated, with the prior 0 +- that of steel: one
-for drives (screws, racks and their zeros), one for the frame (joint centres, arms, rods of constant
-length). What a growth of parameters theta does to a closure c equals a change of its reading q, to
-first order: ``dc/dq dq = dc/dtheta dtheta``. The machine that results is that at the mean.
+is L (1 + g (T - mean)). Two coefficients g are estimated, with a prior of zero mean and steel's
+coefficient as sigma: one for drives (screws, racks and their zeros), one for the frame (joint
+centres, arms, rods of constant length). A growth of the parameters theta has the same effect on a
+closure c as a change of its reading q, to first order: ``dc/dq dq = dc/dtheta dtheta``. The
+estimated machine is that at the mean temperature.
 """
 
 from __future__ import annotations
