@@ -436,6 +436,8 @@ def locate_stations(
         rngs = rng.spawn(len(images) + 1)
         count = sum(len(p.images) for p in images)
         progress(f"Localizing the stations by {count} images", 0.0)
+        # by the legs, unless a mistake explains the images better; others through boards on the
+        # base
         value = localize_by_legs(session, images, poses, rngs[1:], boards, start_poses)
         progress("Testing hypotheses about the images", 0.8)
         mixed_up = mistake_in(session, images, value, rngs[0])

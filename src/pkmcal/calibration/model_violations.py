@@ -475,6 +475,7 @@ def _joint_offsets(
             axis = getattr(node, "axis", None)
             if node.joint != "universal" or axis is None or not layout.rod_reads[j]:
                 continue
+            # cos(beta) is the sine of the angle between leg and first axis
             v = to_base @ (np.array(axis) / np.linalg.norm(axis))
             across = np.sqrt(1 - np.sum(u[:, j] * v, axis=-1) ** 2)
             by = np.zeros((*measured.joints.shape, 1))

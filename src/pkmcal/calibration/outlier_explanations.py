@@ -96,6 +96,7 @@ def outlier_explanations(
     measured = MeasuredPlatforms(
         estimate.machine, measurements.poses.configuration[which], poses, noise
     )
+    # poses that the machine can take, enough for a scale of their differences
     off = measured.differences(joints)
     finite = np.flatnonzero(np.isfinite(off).all(axis=1) & np.isfinite(noise).all(axis=(1, 2)))
     measured, off, which = measured.select(finite), off[finite], which[finite]
@@ -106,6 +107,7 @@ def outlier_explanations(
     if usual > HOPELESS_POSE_SCALE**2:
         return  # no pose fits, so there are no outliers
     measured = measured._replace(noise=usual * measured.noise)
+    # rejected poses that are outliers at that scale
     least = SESSION_FALSE_ALARM.of_test(Search.OUTLIERS, len(which))
     rejected = estimate.pose_weights[which] < INLIER_WEIGHT
     odd = np.unique(measured.configuration[rejected & (_chance(m, squares / usual) < least)])

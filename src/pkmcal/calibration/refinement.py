@@ -278,6 +278,7 @@ def imputation_variance(
     by_hand = any(session.stations[p.station].handheld for p in turns.images)
     if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
         return turns
+    # estimates from edges that drawn machines predict
     offsets: list[Array] = []
     failures: list[str] = []
     for number, drawn in enumerate(_as_likely(session, estimate, options.imputations, rng)):
@@ -295,6 +296,7 @@ def imputation_variance(
             failures.append(str(error))
             continue
         offsets.append(ended.state.theta)
+    # between-imputation variance, relative to that by noise, in the covariance of the first pass
     variance = 1.0  # as large as the noise's, if fewer than two imputations gave an estimate
     if len(offsets) > 1:
         apart = np.stack(offsets) - np.mean(offsets, axis=0)
@@ -552,6 +554,7 @@ def _first_estimate(
     own prediction.
     """
     session, images, boards, scene = case
+    # hand-held images have their edges already
     begin = partial(
         start_state,
         scene.machine,

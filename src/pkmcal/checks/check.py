@@ -96,6 +96,7 @@ def _check(folder: Path, seed: int, progress: Progress) -> SessionCheck:
     findings += [*broken, *motion.findings, *observed.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
     findings += numbering_note(session)
+    # Forecast of a full capture.
     progress("What such images will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no station for further images
     expected = None

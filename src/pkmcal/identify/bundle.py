@@ -249,6 +249,7 @@ def _settle(
     for number in range(options.most_rounds):
         noise = _Noise.of(fit)
         if scale_noise:
+            # noise of poses and links, of the readings, and of edges and lines, by the residuals
             noise = noise.with_scales(fit)
             if noise.scale.poses.min() > hopeless:
                 return replace(fit, scale=noise.scale)
@@ -256,9 +257,11 @@ def _settle(
             noise = noise.with_edges(fit, by_tube, number, least, options)
         if by_data.any():
             noise = noise.with_readings(fit, np.where(by_data, np.exp(made), 1.0))
+        # weights by that noise
         weight, irls_weight = fit.weight, fit.irls_weight
         if robust:
             weight, irls_weight = _weights(fit, noise, by_tube)
+        # converged, or the next solution
         if noise.close_to(fit, by_tube, options) and _settled(
             noise.scale, fit.scale, weight, fit.weight, options.scale_change
         ):

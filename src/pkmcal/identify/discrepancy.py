@@ -283,6 +283,7 @@ class _Search:
         beyond = self.options.least_ratio(len(self.components))
         named = sum(one.code.startswith(NAMED) for one in self.components)
         while len(self.scales) < self.options.most + named:
+            # scale and likelihood ratio of each remaining component, with each of its roots
             squared, value = self._remainder()
             codes = {one.code for one in self.scales}
             best: ComponentScale | None = None
@@ -301,6 +302,7 @@ class _Search:
                         best = ComponentScale(one.code, scale, ratio, root, length)
             if best is None:
                 return
+            # the most likely one becomes part of the noise
             self.scales.append(best)
             self.gain += best.ratio / 2
             (k,) = (k for k, one in enumerate(self.components) if one.code == best.code)

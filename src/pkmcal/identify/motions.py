@@ -277,6 +277,7 @@ def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
     """Motions of one leg: axes, radii, the leg along itself, then each parameter and each point
     alone.
     """
+    # both axes rotated together
     base, platform = s.fields[leg].get("base.axis"), s.fields[leg].get("platform.axis")
     if base is not None and platform is not None:
         values, rot = s.machine.values, s.T_base_platform[0, :3, :3]
@@ -292,6 +293,7 @@ def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
     what = {field: s.label(rows) for field, rows in s.fields[leg].items()}
     axes = [field for field in alone if field.endswith("axis")]
     points = [f for f, own in alone.items() if own.shape[1] == 3 and f not in (*axes, "tubes")]
+    # each axis, the tubes' radii, the leg along itself
     for field in axes:
         one = f"the direction of the {what[field]} of {{each}}{{legs}} {{is}}"
         yield NamedChanges((leg,), alone[field], one, advice="turn")
@@ -299,6 +301,7 @@ def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
         one = "the tubes' radii of {legs} {are}"
         yield NamedChanges((leg,), alone["tubes"], one, advice="caliper")
     yield _along(s, leg)
+    # each other parameter, and each point, alone
     for field in (f for f in alone if f not in (*axes, *points, "tubes")):
         yield NamedChanges((leg,), alone[field], f"the {what[field]} of {{each}}{{legs}} {{is}}")
     for field in points:

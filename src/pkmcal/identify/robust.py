@@ -283,6 +283,7 @@ def anneal(problem: Problem, start: BatchState, options: RobustOptions = ROBUST)
         weight = RowGroups(
             *(geman_mcclure_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True))
         )
+        # weights at that scale, then a few solver steps
         searched = problem.weighted(weight).as_noisy_as_at(state)
         solution = minimise(searched, state, max_steps=most)
         state, steps = solution.state, steps + int(solution.steps.max())

@@ -558,6 +558,7 @@ def columns_of(
         c = part.closure(part.state_among(state, cut))
         out = np.zeros((len(part.blocks.present), part.n_rows, readings.shape[-1]))
         out[:, part.closure_rows] = part.by_readings(c, readings[cut])[0]
+        # whitened derivatives of edges and poses; residuals are predicted minus measured
         of_edges = part.data.weighed[0]
         of_poses = (np.sqrt(part.pose_data.weight)[..., None, None] * part.pose_data.whiten)[0]
         before, after = (out[:, kind.rows] for kind in part.row_groups[:2])
@@ -567,6 +568,7 @@ def columns_of(
                 before[..., where] = -(of_edges @ edges[cut]).reshape(shape)
             if poses is not None:
                 after[..., where] = -(of_poses @ poses[cut]).reshape(shape)
+        # motions act as the stations' poses do
         by_station = linear.by_shared[0][..., problem.unknowns.stations]
         for where, motion in moving:
             each = motion[:, cut].swapaxes(0, 1)

@@ -171,6 +171,7 @@ def hold(
 
     Raises ResultError if the poses are not found.
     """
+    # Problem with the machine fixed, with the given noise if any.
     still = held_machine(machine, radii=data_weights is None)
     shading = SHADING_SIGMA if data_weights is None else data_weights.shading
     if data_weights is not None:
@@ -180,6 +181,7 @@ def hold(
     assembled = assemble(still, measurements, default_gauge(still), shading=shading)
     begin = batch_of(still, assembled, replace(start, theta=still.values))
     if data_weights is None:
+        # Weights and noise are estimated if there are enough rows.
         linear, unknowns = assembled.problem.linearize(begin), assembled.problem.unknowns.count
         unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
         if int(linear.usable.sum()) + len(linear.shared_by) < unknowns:

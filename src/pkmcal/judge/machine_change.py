@@ -77,6 +77,7 @@ def machine_change(
     same_nominal : whether both calibrations have the same nominal model.
     shared : share of the smaller data set that the other calibration has as well.
     """
+    # b's parameters and covariance in frames aligned to a's
     held = replace(a, parameters=replace(a.parameters, nominal=a.values))
     table, layout = held.parameters, held.layout
     none = np.zeros((0, 4, 4))
@@ -99,6 +100,7 @@ def machine_change(
     change = there - a.values
     invariant = rest.T @ inward
     y = invariant @ change
+    # covariance of the difference apart from frames, and its chi-square
     spreads = [None if c is None else invariant @ c @ invariant.T for c in (cov_a, cov_b)]
     spread, null_space = _spread(spreads, y.size, same_nominal, shared)
     outward = table.free_matrix() * tolerance @ rest

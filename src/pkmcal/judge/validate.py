@@ -116,6 +116,7 @@ def validate_calibration(
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
         check_predictable(session)
+        # New configurations, measured and estimated with the machine free.
         lines, calibrated = paths_of(session), calibrated_rows(saved, session)
         if not regions:
             check_new(calibrated, _has_image(session), *NOT_INDEPENDENT)
@@ -129,6 +130,7 @@ def validate_calibration(
         prediction = predict(saved.machine, data, estimate.state)
         if not regions:
             check_new(calibrated, prediction.observed, *NOT_INDEPENDENT)
+        # Calibrated and nominal machine compared on the new configurations.
         judged, failed = None, tuple[Finding, ...]()
         repeated = ~calibrated & repeated_rows(saved, session)
         new = np.flatnonzero(prediction.observed & ~calibrated)

@@ -137,6 +137,7 @@ def watch_machine(
         saved, session = read_same_machine(calibration, session)
         _check_usable(saved)
         session = _with_fixed_poses(saved, session, same_place)
+        # New configurations, measured and estimated with the machine free.
         calibrated = calibrated_rows(saved, session)
         check_new(calibrated, np.ones_like(calibrated), *NOTHING_NEW)
         remeasured = measured_new_data(saved, session, seed, part(progress, 0, 0.9))

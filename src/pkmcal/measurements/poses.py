@@ -158,6 +158,7 @@ def pose_rows(
     camera = T_camera_base[:, blocks.station]
     body = np.where(moving, poses[:, :, None], np.eye(4))
     mount = T_mount[:, blocks.mount]
+    # error of the predicted pose, and the inverse left Jacobian of its rotation vector
     rot_c, rot_b = camera[..., :3, :3], body[..., :3, :3]
     arm = rot_b @ mount[..., :3, 3:]
     place = rot_c @ (arm + body[..., :3, 3:])
@@ -173,6 +174,7 @@ def pose_rows(
         out[..., 3:, 3:] = by_shift
         return weigh @ out
 
+    # effects, and derivatives by station, platform and mount
     eye, by_columns = np.eye(3), weigh @ data.columns
     numbers = with_zero(columns)[:, blocks.column]  # the last one is for padding
     value = (weigh @ error[..., None] + by_columns @ numbers[..., None])[..., 0]

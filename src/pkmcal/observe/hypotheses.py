@@ -164,10 +164,12 @@ def mistake(
     options: ImageEvidenceOptions = IMAGE_EVIDENCE,
 ) -> InputError | None:
     """Error about stations whose images disagree with the session, None if all agree."""
+    # exchanged stations
     error = _swapped_stations([s for s in stations if s.elsewhere], rng)
     if error is not None or not stations:
         return error
     bad = [station for station in stations if not station.localization.good]
+    # the station with the least evidence decides about the readings
     worst = max(
         stations, key=lambda s: (not s.localization.good, s.elsewhere, s.localization.p_value)
     )
@@ -180,6 +182,7 @@ def mistake(
         rest = (station for station in stations if station is not worst)
         errors = (_likelier(s, list(_other_images(s, options)), True, rng, options) for s in rest)
         return next((error for error in errors if error is not None), None)
+    # no hypothesis explains the images
     others = [station.name for station in bad if station is not worst]
     at = ", nor in those of " + listed(others) if others else ""
     few = len(worst.view.configuration) < ENOUGH_IMAGES_ALONE
@@ -252,6 +255,7 @@ def _swapped_stations(
             Hypothesis("station.exchanged", subject, exchanged),
             Hypothesis("image.mirrored", subject, mirrored),
         ]
+        # both machines have to be localized near the exchanged poses
         level = EvidenceLevel("near search", partial(by_near_search, (one, other)))
         best = decide(posterior(hypotheses, [level], SEARCH_OPTIONS))
         if best is not None and best.hypothesis.code == "station.exchanged":

@@ -172,6 +172,7 @@ def draw_truth(
 
     cameras : one for each station; for hand-held images without their breathing.
     """
+    # true machine; stations, and their poses as session.yaml states them
     rngs = {name: np.random.default_rng(stream(seed, name)) for name in RANDOM_STREAMS}
     machine = true_machine(nominal, settings.tolerance, rngs["machine"])
     poses = settings.stations
@@ -191,6 +192,7 @@ def draw_truth(
         )
         for T, pose in zip(T_camera_base, poses, strict=True)
     )
+    # configurations, board, noise of the readings
     T_base_platform, joints, images = _configurations(
         nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
     )
@@ -253,10 +255,12 @@ def _configurations(
     n, repeats = settings.configurations, settings.repeats
     wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
+    # candidates that the nominal model reaches in the same assembly mode
     by_nominal = nominal.forward_result(joints)
     reached = by_nominal.converged & platform_unfolded(nominal, by_nominal.T_base_platform)
     reached &= same_mode(by_nominal.T_base_platform, poses)
     poses, joints = poses[reached], joints[reached]
+    # candidates in view of each group of stations, and the selection of each group
     in_view = np.stack(
         [
             in_picture(machine, camera, T, poses, joints)
@@ -280,6 +284,7 @@ def _configurations(
         taken[rows] = True
         chosen.append(rows)
     rows = _without_repeats(np.concatenate(chosen), groups, joints)
+    # pairs of station and configuration
     stations = range(len(cameras))
     if settings.handheld:
         pairs = [(s, s // repeats) for s in stations]
