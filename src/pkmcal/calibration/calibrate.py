@@ -310,13 +310,13 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
 
 
 class Settled(NamedTuple):
-    """A repaired session and its estimate, which no hypothesis explains better.
+    """Repaired session and its estimate, after no remaining hypothesis is decided for.
 
     stated : estimate with the readings' noise as stated.
     richer : another model of the mechanism file that explains the poses, if any.
     repairs : hypotheses by which the data were changed.
-    findings : on repairs, on hypotheses that are likely but not decided for, and on those that
-        could not be tested.
+    findings : on repairs, on hypotheses that are likely but were not adopted, and on hypotheses
+        that could not be tested.
     """
 
     case: Case
@@ -335,22 +335,23 @@ def settle(
     clock: Clock,
     options: RefinementOptions = REFINEMENT,
 ) -> Settled:
-    """Localize, estimate, and compare all hypotheses about a session, until none explains it
-    better.
+    """Localize, estimate and compare all hypotheses about a session, until no repair is decided
+    for.
 
-    `calibrate` continues from the result, and `check` ends with it. Hypotheses are compared with
-    the data as stated. A repair changes the data, so after each one the machine is localized and
+    `calibrate` continues from the result; `check` ends with it. Hypotheses are compared with the
+    data as stated. A repair changes the data, so after each one the machine is localized and
     estimated, and all hypotheses are compared again. Each camera's file is repaired once at most,
     and stations are only removed, which bounds the number of repetitions.
 
-    case : of the session.
+    case : observations of the session.
 
-    Raises `InputError`, the likeliest mistake, or `ResultError` where there is no estimate.
+    Raises `InputError` for the most likely error in the input, `ResultError` where there is no
+    estimate.
     """
     repairs: list[Ranked[UpsideDown]] = []
     while True:
         now, clock = clock.part(0, 0.8), clock.part(0.8, 1)
-        # mistakes in the readings, without which no estimate means anything
+        # errors in the readings first: with one of them, no estimate is valid
         refuse(partial(explain_closure, case.session, case.boards))
         try:
             turns = _identify(case, refine_camera, now.part(0, 0.9), options)
@@ -380,7 +381,7 @@ def settle(
         if not wrong:
             break
         case = without_misplaced(case, wrong, turns.measurements.edges, turns.estimate)
-    # mistakes that a user has to correct
+    # errors that only the user can correct
     now.progress("Testing hypotheses about the data", 0.9)
     stated = refit_fixed_noise(case.session.machine, turns.measurements, turns.estimate)
     richer, failed = richer_model(case.session, turns.measurements, stated)

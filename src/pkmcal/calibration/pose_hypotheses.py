@@ -195,8 +195,10 @@ class PoseEvidence:
 
     @property
     def by_confirmation(self) -> EvidenceLevel[PoseHypothesis]:
-        """Level of evidence by joint estimates where the data as stated have none: an estimate
-        compares hypotheses with each other, and closure the best of them with the null hypothesis.
+        """Levels of evidence from joint estimates where the data as stated have no estimate.
+
+        Estimates compare hypotheses with each other; closure compares the best hypothesis with the
+        null hypothesis.
         """
 
         def ratios(hypotheses: Sequence[PoseHypothesis]) -> Array:
@@ -698,11 +700,13 @@ def explain_poses(
 def _explanation(
     session: Session, diagnose: Callable[[], Diagnosis], misfit: float, tenable: bool
 ) -> Explanation:
-    """Explanation with the error that names a diagnosis's mistakes and their rivals.
+    """Error for the hypothesis that a diagnosis selects, with its rivals, and its log-odds.
 
-    A reading that never changes precedes all other mistakes, because its effect may equal that of
-    any of them. misfit : of the poses as stated, in stated sigmas. tenable : whether the data as
-    stated may be right in spite of it.
+    An encoder whose reading never changes precedes all other hypotheses, because its effect may
+    equal that of any of them.
+
+    misfit : of the poses as stated (RMS), in stated sigmas.
+    tenable : whether the data as stated are not rejected at this misfit.
     """
     frozen = frozen_in(session)
     if frozen and not tenable:

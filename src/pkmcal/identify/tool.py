@@ -25,7 +25,9 @@ from pkmcal.solver.ranks import nonzero
 
 @dataclass(frozen=True)
 class PoseSamplingOptions:
-    """Constants of the poses sampled around a session's, so that errors outside of it count."""
+    """Constants of the poses sampled around a session's, which weigh errors outside of its
+    workspace.
+    """
 
     # number of samples, and their seed
     count: int = 40

@@ -297,7 +297,7 @@ class Surroundings:
     def place(self, one: int, landmarks: Mapping[int, Landmarks]) -> Array:
         """Camera pose T_camera_base (0 or 1, 4, 4) of an image from its matches with landmarks.
 
-        P3P in RANSAC, refined on the inliers; empty with fewer than the options' fewest of them.
+        P3P in RANSAC, refined on the inliers; empty with fewer inliers than the options require.
         """
         import cv2
 

@@ -1,16 +1,17 @@
 """Camera localization from a single image without a prior.
 
-Camera positions all round the machine, at distances at which it fills the image or a third of it,
-rotations about the optical axis and positions in the image are scored by the middles of the tubes
-on a chart of possible tubes (:mod:`pkmcal.observe.tubes`). The best few thousand descend as in the
-localization of a station (:mod:`pkmcal.observe.pose_likelihood`), on tables with three times as
-many edge directions. The best of these are refined on tables of twice and four times the
-resolution, where texture contributes much less log likelihood and the machine more.
+Coarse poses: camera directions all round the machine, distances at which it fills a third of the
+image to more than all of it, rotations about the optical axis, and positions in the image. They are
+scored by the centres of the tubes on a chart of possible tubes (:mod:`pkmcal.observe.tubes`). The
+best few thousand descend as in the localization of a station
+(:mod:`pkmcal.observe.pose_likelihood`), on tables with three times as many edge directions. The
+best of these are refined on tables of twice and four times the resolution, where texture
+contributes much less log likelihood and the machine more.
 
-The second best hypothesis measures the certainty of the best: clutter rarely produces a single
-match, and a machine of equal parts looks nearly the same from several sides. An error of the
-nominal model moves all edges of a leg together, so in this comparison each half of a leg counts as
-one measurement.
+The log-likelihood ratio to the second best hypothesis measures the certainty of the best: clutter
+rarely produces a single match, and a machine of equal parts looks nearly the same from several
+sides. An error of the nominal model moves all edges of a leg together, so in this comparison each
+half of a leg counts as one measurement.
 """
 
 from __future__ import annotations

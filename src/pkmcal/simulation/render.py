@@ -327,8 +327,9 @@ def _over_area(
 ) -> Array:  # fmt: skip
     """Mean light (n,) over the area of each border pixel, in the order of the mask.
 
-    hits : (H, W) through the pixels' centres. Where a pixel and all its neighbours see the same
-    whole lamp, or none of it, so does every point between them; that holds for most borders.
+    hits : (H, W) of the rays through the pixels' centres. Where the lamp is entirely visible from a
+        pixel and all its neighbours, or entirely hidden from all of them, no shadow ray is cast for
+        the samples between; this holds for most borders.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 

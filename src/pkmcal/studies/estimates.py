@@ -56,7 +56,7 @@ def nominal_estimate(machine: Machine, runs: int) -> Fitted:
 
 
 def joint(problem: Problem, start: BatchState) -> BatchResult:
-    """Joint maximum-likelihood estimate with the true noise, which a simulation knows."""
+    """Joint maximum-likelihood estimate with the true noise levels of the simulation."""
     return solve_batch(problem, start, robust=False, scale_noise=False)
 
 
