@@ -39,27 +39,27 @@ from pkmcal.session.readings import rounding_step
 from pkmcal.wording import listed
 
 UNTOLD_BOARD_SIZE_SIGMA = 0.7
-"""Share of the prior sigma of a board's size from which its sigma is due to the file rather than to
-the data."""
+"""Ratio of the posterior to the prior sigma of a board's size above which the size is determined by
+the file rather than by the data."""
 BOARD_SIZE_DISAGREEMENT = 2.0
 """Standard deviations between a board's size by its file and by all other data from which a note
 reports both: by chance one session of twenty."""
 WRONG_SCALE_DEVIATIONS = 3.0
 """Standard deviations from the nominal scale of a reading from which a note reports it."""
 WRONG_MODEL_READING_SCALE = 100.0
-"""Factor on the readings' stated noise from which the scatter is a model error: mounted encoders
-are ten or thirty times as noisy as their data sheets."""
+"""Factor on the readings' stated noise above which the scatter is a model error: mounted encoders
+are ten or thirty times as noisy as in their data sheets."""
 FEWEST_POSES = 4
-"""Whole poses of one station from which the platform's rotation is tested."""
+"""Smallest number of whole poses of one station for a test of the platform's rotation."""
 
 
 def wrong_scale(estimate: Estimate) -> float:
-    """Common factor of all estimated lengths to the nominal lengths; 1 if no common factor explains
-    their difference. A board whose squares are larger than stated makes the whole machine larger.
+    """Ratio of all estimated lengths to the nominal lengths; 1 if no common ratio explains their
+    difference.
 
-    The factor is a hypothesis about differences in prior sigmas whose true size is unknown, so that
-    a poor nominal model has none, and has to explain most of their squares: a factor of one kind of
-    part makes a part of them only.
+    A board whose squares are larger than stated makes the whole machine larger. The hypothesis of a
+    common ratio has to explain most of the squared differences, in prior sigmas: with a poor
+    nominal model, or a ratio of one kind of part only, it does not.
     """
     machine = estimate.machine
     table = machine.parameters
@@ -86,8 +86,9 @@ def wrong_scale(estimate: Estimate) -> float:
 
 
 def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
-    """Estimate with the readings' noise as stated, for the comparison of hypotheses: otherwise the
-    noise scale would absorb a wrong sign, or an insufficient model.
+    """Estimate with the readings' noise as stated, for the comparison of hypotheses.
+
+    Otherwise the noise scale would absorb a wrong sign, or an insufficient model.
     """
     if estimate.statistics.reading_scale <= 1 or not len(measurements.poses):
         return estimate
@@ -95,8 +96,8 @@ def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Es
 
 
 def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """Reason against a result whose readings scatter by more than the nominal model's prior sigma,
-    so that they determine nothing, or by too much more than stated to be noise.
+    """Refusal if the noise of the readings exceeds the prior sigmas, so that they determine
+    nothing, or exceeds the stated noise so much that it is a model error.
     """
     s, tolerance = estimate.statistics, session.machine.document.tolerance
     units, noise = set(session.machine.joint_units), session.joint_noise * s.reading_scale
@@ -134,10 +135,10 @@ def _rounding(session: Session, noise: float) -> dict[str, Any]:
 def richer_model(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[RicherModel | None, tuple[Finding, ...]]:
-    """Richer model of the mechanism file that explains poses for which this model is insufficient,
-    None without such a model; and notes on models without an estimate.
+    """Richer model of the mechanism file that explains poses for which this model is insufficient.
 
-    Each additional parameter costs half a log n (:func:`parameter_cost`).
+    None without such a model; and notes on models without an estimate. Each additional parameter
+    costs half a log n (:func:`parameter_cost`).
     """
     null, machine = estimate.statistics.pose_scale, session.machine
     if null < POOR_MODEL_POSE_SCALE:
@@ -172,8 +173,9 @@ def richer_model(
 
 
 def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """Reason against a result whose lengths all have a common factor. Heights alone leave sizes to
-    the nominal model, whatever an uneven bed makes of them.
+    """Refusal if all estimated lengths have a common ratio to the nominal ones.
+
+    Not for heights alone, which do not determine sizes.
     """
     if only_heights(estimate):
         return
@@ -188,8 +190,8 @@ def noise_notes(
 ) -> Iterator[Finding]:
     """Warnings where the data contradict the noise that session.yaml states.
 
-    detections : whether a model violation makes readings scatter. explained : whether heights
-    scatter because the bed is uneven.
+    detections : whether a model violation explains the scatter of readings.
+    explained : whether an uneven bed explains the scatter of heights.
     """
     if explained:
         return
@@ -243,7 +245,7 @@ def size_notes(
         if sigma <= UNTOLD_BOARD_SIZE_SIGMA * tolerance:
             yield note("board.size_estimate", file, value=value, sigma=sigma)
             continue
-        # without the prior, which is the file's, the estimate is that of all other data
+        # the prior, which is the file's, is removed: 1 / other is the factor on the estimate
         other = max(1 - (sigma / tolerance) ** 2, np.finfo(float).eps)
         facts = {"tolerance": 100 * tolerance}
         if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT * tolerance:

@@ -1,5 +1,4 @@
-"""New data of a calibrated machine: configurations that are new, and a first estimate by these
-data.
+"""Measurements of a calibrated machine in a new session, and the configurations that are new.
 
 The calibrated machine, free within its prior sigmas, is the best start for measuring the images; of
 this estimate only the measurements and the poses of platform and stations are used.
@@ -54,7 +53,7 @@ def repeated_rows(saved: SavedCalibration, session: Session) -> Booleans:
 
 
 def check_new(valid: Booleans, visible: Booleans, what: str, expected: str, next_step: str) -> None:
-    """Raise `InputError`, in these words, if no observed configuration is new to the
+    """Raise `InputError`, with the given texts, if no observed configuration is new to the
     calibration.
     """
     if not np.any(visible & ~valid):
@@ -98,9 +97,10 @@ def measured_new_data(
 
 
 def _as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
-    """Stations with the camera response and the half turn of images that the calibration found.
+    """Stations with the camera response and the half turn of images that the calibration
+    determined.
 
-    The session's own response has precedence. A few new images determine both worse.
+    The session's own response has precedence. A few new images determine both less reliably.
     """
     responses = {row["name"]: row.get("response") for row in saved.document["stations"]}
     turned = {
@@ -121,7 +121,7 @@ def _as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, 
         # Turn the images by half where the calibration had to.
         camera = station.camera
         turned_camera = turned.get(station.camera_file)
-        # otherwise the file has been corrected since, or is another one
+        # otherwise the camera file was corrected since the calibration, or replaced
         if turned_camera is not None and np.allclose(
             camera.turned_by_half().parameters, turned_camera.parameters
         ):

@@ -53,10 +53,13 @@ def simulate_session(
 ) -> Truth:
     """Write a simulated session into a new folder, completely or not at all.
 
-    The truth is written to truth.json. camera : one for all stations, or one for each. workers :
-    threads that render; the result does not depend on their number. progress : called with the
-    number of finished images and of all. Raises InputError if the folder is not empty or the
-    machine cannot be rendered.
+    The truth is written to truth.json.
+
+    camera : one for all stations, or one for each.
+    workers : threads that render; the result does not depend on their number.
+    progress : called with the number of finished images and of all.
+
+    Raises InputError if the folder is not empty or the machine cannot be rendered.
     """
     settings = settings or Settings()
     folder = Path(folder)
@@ -83,8 +86,10 @@ def _breathed(camera: Camera, scale: float) -> Camera:
 class Studio:
     """Everything that the images of one session share.
 
-    cameras : by station. views : rays of each camera with more than one image, by the camera's id.
-    fixed : parts that are fixed to the base. as_built : with motors, rings and cables on the legs.
+    cameras : by station.
+    views : rays of each camera with more than one image, by the camera's id.
+    fixed : parts that are fixed to the base.
+    as_built : with motors, rings and cables on the legs.
     """
 
     truth: Truth

@@ -69,21 +69,26 @@ class RequestedConfigurations:
 class Settings:
     """Properties of a simulated session.
 
-    stations : their number, or their poses. configurations : number of images of each station.
-    shared : all stations see the same configurations; by default each has its own. tolerance :
-    standard deviation of the true values about the nominal model, in prior sigmas. joint_noise :
-    standard deviation of a reading, m. rough_position, rough_angle : errors of the session's
-    station poses, m and rad. extreme : share of configurations with every leg near an end of its
-    range, as far as there are that many different poses. board : board that every station sees,
-    fixed to ``board_on``. observe : value of ``observe`` in session.yaml for stations that see a
-    board. repeats : images of each configuration from each station, with independent sensor noise.
-    shake : standard deviations (m, rad) of the camera's motion between repeats. finish, light : of
-    the legs and of the room. as_built : motors, rings and cables on the legs that are not in the
-    nominal model. asked : these configurations instead of random ones. handheld : each image from a
-    pose of its own about the machine, ``repeats`` of each configuration, with focal lengths that
-    vary by ``breathing``, one standard deviation; ``stations`` is then ignored. warming : K, by
-    which the machine warms over the session; its readings have the growth of drives and frame, and
-    images show it as it is at first.
+    stations : number of stations, or their poses.
+    configurations : number of images of each station.
+    shared : whether all stations observe the same configurations; by default each has its own.
+    tolerance : standard deviation of the true values about the nominal model, in prior sigmas.
+    joint_noise : standard deviation of a reading, m.
+    rough_position, rough_angle : errors of the session's station poses, m and rad.
+    extreme : share of configurations with every leg near an end of its range, as far as there are
+        that many different poses.
+    board : board that every station observes, fixed to ``board_on``.
+    observe : value of ``observe`` in session.yaml for stations that observe a board.
+    repeats : images of each configuration from each station, with independent sensor noise.
+    shake : standard deviations (m, rad) of the camera's motion between repeats.
+    finish, light : of the legs and of the room.
+    as_built : whether legs have motors, rings and cables that are not in the nominal model.
+    asked : requested configurations, instead of random ones.
+    handheld : whether each image has a pose of its own around the machine, with ``repeats`` images
+        of each configuration and focal lengths with the relative standard deviation ``breathing``;
+        ``stations`` is then ignored.
+    warming : K, increase of the machine's temperature over the session. The readings contain the
+        growth of drives and frame, the images show the machine as it is at first.
     """
 
     stations: int | tuple[StationPose, ...] = default("simulate", "stations")
@@ -161,13 +166,18 @@ class TrueEffects:
 class Truth:
     """Values that a user never has, in the base frame of the true machine's centres.
 
-    machine : with its true values. stations, configurations : names, S and K.
-    T_camera_base : (S, 4, 4). rough : station poses in session.yaml. T_base_platform : (K, 4, 4).
-    joints : (K, m) exact readings. readings : (K, m) with noise. images : (M, 2) numbers of
-    the station and the configuration of each image. seed : seed of all random numbers.
-    T_base_board, T_platform_board : (4, 4) pose of the board, if any. repeats : images of each
-    pair. focal_scale : (S,) factors on the camera's focal lengths, for hand-held images. effects :
-    on the readings: temperatures, growth and compliance.
+    machine : with its true values.
+    stations, configurations : names, S and K.
+    T_camera_base : (S, 4, 4).
+    rough : station poses in session.yaml.
+    T_base_platform : (K, 4, 4).
+    joints, readings : (K, m) exact readings, and readings with noise.
+    images : (M, 2) numbers of the station and the configuration of each image.
+    seed : seed for all random numbers.
+    T_base_board, T_platform_board : (4, 4) pose of the board, if any.
+    repeats : number of images of each pair.
+    focal_scale : (S,) factors on the camera's focal lengths, for hand-held images.
+    effects : on the readings: temperatures, growth and compliance.
     """
 
     machine: Machine
@@ -213,6 +223,7 @@ def draw_truth(
 
     cameras : one for each station; for hand-held images without their breathing.
     """
+    # true machine; stations, and their poses as session.yaml states them
     rngs = {name: np.random.default_rng(stream(seed, name)) for name in RANDOM_STREAMS}
     machine = true_machine(nominal, settings.tolerance, rngs["machine"])
     poses = settings.stations
@@ -232,6 +243,7 @@ def draw_truth(
         )
         for T, pose in zip(T_camera_base, poses, strict=True)
     )
+    # configurations, board, noise of the readings
     T_base_platform, joints, images = _configurations(
         nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
     )
@@ -296,10 +308,12 @@ def _configurations(
     n, repeats = settings.configurations, settings.repeats
     wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
+    # candidates that the nominal model reaches in the same assembly mode
     by_nominal = nominal.forward_result(joints)
     reached = by_nominal.converged & platform_unfolded(nominal, by_nominal.T_base_platform)
     reached &= same_mode(by_nominal.T_base_platform, poses)
     poses, joints = poses[reached], joints[reached]
+    # candidates in view of each group of stations, and the selection of each group
     in_view = np.stack(
         [
             in_picture(machine, camera, T, poses, joints)
@@ -323,6 +337,7 @@ def _configurations(
         taken[rows] = True
         chosen.append(rows)
     rows = _without_repeats(np.concatenate(chosen), groups, joints)
+    # pairs of station and configuration
     stations = range(len(cameras))
     if settings.handheld:
         pairs = [(s, s // repeats) for s in stations]
