@@ -211,7 +211,7 @@ class ScoreTests:
 
         for _, k in likely():
             if k not in self._scatter:
-                self._scatter[k] = self._scattered(k, others)
+                self._scatter[k] = self._cluster_factor(k, others)
         once: dict[tuple[str, str], int] = {}
         for _, k in likely():
             once.setdefault((listed[k].code, listed[k].subject), k)

@@ -97,7 +97,7 @@ class ImageEvidenceOptions:
     # side, and a machine of equal parts looks the same from each. The refusal names the pose as a
     # rival
     pose_by_hand: float = 1000.0
-    # margin, as a share of the mean log-likelihood ratio of a station's images, by which a hypothesis
+    # margin, as a share of the mean log-likelihood ratio of a station's images, by which a mistake
     # has to be likelier: another name of an image, another numbering of the legs, or any mistake
     # where the machine was not localized as stated. Between nearly equal configurations, equal
     # parts of a machine, or a machine and its mirror image from the opposite side, errors of the
