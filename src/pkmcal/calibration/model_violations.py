@@ -7,8 +7,9 @@ false-alarm level of the session (:mod:`pkmcal.identify.score`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby, islice, product
 from typing import Any, NamedTuple
 
@@ -46,6 +47,8 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
 from pkmcal.session.load import Session
 
+Family = Callable[[Session, Observation, Measurements, Estimate], Iterable[Column]]
+"""Columns of model violations that share a part of the false-alarm level."""
 MOST_TOOL_SHIFT = 1.0
 """Shift of the tool by a violation, in standard deviations, beyond which the result is refused."""
 
@@ -118,15 +121,22 @@ def model_violations(
     observation: Observation,
     measurements: Measurements,
     estimate: Estimate,
+    tested: Sequence[Family] | None = None,
 ) -> ModelViolations:
     """Deviations of the data from the model, with and without names.
 
     A violation is named only if it explains more than the discrepancy does: those that are detected
-    first are tested once more beside the discrepancy.
+    first are tested once more beside the discrepancy. The discrepancy in turn is estimated beside
+    the violations that are named, and beside no others.
+
+    tested : families of violations, :data:`TESTED` by default.
     """
     ended = estimate.linearized
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
-    families = [list(family(session, observation, measurements, estimate)) for family in TESTED]
+    families = [
+        list(family(session, observation, measurements, estimate))
+        for family in (TESTED if tested is None else tested)
+    ]
     tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
     further = [one for one in columns_of_effects(measurements) if one.prior is None]
     families += [list(group) for _, group in groupby(further, key=lambda one: one.code)]
@@ -146,7 +156,7 @@ def model_violations(
         configuration = session.configurations[in_view[row]]
         return readings.wrong_reading(columns[m], units[m], configuration, by)
 
-    def tested(beside: Sequence[Column]) -> tuple[ScoreTests, list[tuple[int, Score]]]:
+    def scored(beside: Sequence[Column]) -> tuple[ScoreTests, list[tuple[int, Score]]]:
         tests = ScoreTests(
             *ended,
             listed,
@@ -158,16 +168,25 @@ def model_violations(
         value = tests.significant([k for k, _ in tube_scores])
         return tests, [*value, *tube_scores]
 
-    tests, value = tested(())
-    discrepancy = discrepancy_of(
-        *ended,
-        discrepancy_components(measurements, estimate),
-        [declared(k) for k, _ in value],
-        (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
-        only_heights(estimate),
-    )
-    if discrepancy.scales and value:
-        tests, value = tested(discrepancy.random)
+    components = discrepancy_components(measurements, estimate)
+    tests, value = scored(())
+    rivals = detected = [k for k, _ in value]
+    while True:
+        discrepancy = discrepancy_of(
+            *ended,
+            components,
+            [declared(k) for k in rivals],
+            (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
+            only_heights(estimate),
+        )
+        if not detected or (rivals is detected and not discrepancy.scales):
+            break
+        # a rival that is no violation beside the discrepancy must have no part in it
+        tests, value = scored(discrepancy.random)
+        named = {k for k, _ in value}
+        if named.issuperset(rivals):
+            break
+        rivals = [k for k in rivals if k in named]
     before = tool_of(session, estimate)
     estimate = with_discrepancy(estimate, discrepancy)
     tool = tool_of(session, estimate) if discrepancy.scales else before
@@ -238,22 +257,17 @@ def _reading_scales(
     yield from readings.scale_columns(measured.joints, document["columns"], present[first])
 
 
-def _reading_plays(
-    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+def _motors(
+    columns: Callable[[Array, Sequence[str], Sequence[str]], Iterator[Column]],
+    session: Session,
+    observation: Observation,
+    measured: Measurements,
+    estimate: Estimate,
 ) -> Iterator[Column]:
-    """Motors with play."""
+    """Columns of the motors' readings, from their names and units."""
     del observation, estimate
     names, units = session.document["joints"]["columns"], session.machine.joint_units
-    yield from readings.play_columns(measured.joints, names, units)
-
-
-def _eccentric_encoders(
-    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
-) -> Iterator[Column]:
-    """Cranks whose encoders' discs are not centred."""
-    del observation, estimate
-    names, units = session.document["joints"]["columns"], session.machine.joint_units
-    yield from readings.eccentricity_columns(measured.joints, names, units)
+    return columns(measured.joints, names, units)
 
 
 def _lenses(
@@ -489,8 +503,9 @@ def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
     return {"value": size, "sigma": spread, "angles": value.tolist()}
 
 
-TESTED = (
-    _reading_scales, _reading_plays, _eccentric_encoders, _leaning_towers, _screw_leads,
+TESTED: tuple[Family, ...] = (
+    _reading_scales, partial(_motors, readings.play_columns),
+    partial(_motors, readings.eccentricity_columns), _leaning_towers, _screw_leads,
     _joint_offsets, _lenses, _lenses_of_stations, _boards, _tripods,
 )  # fmt: skip
 """What a session takes for granted and that may be otherwise; each is a family of columns."""
