@@ -18,7 +18,7 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import only_heights
-from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, VERDICT, RicherModel
+from pkmcal.identify.verdict import VERDICT, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
@@ -28,6 +28,7 @@ from pkmcal.outcome.hypotheses import (
     Hypothesis,
     decide,
     estimate_level,
+    harmless_misfit,
     log_likelihood,
     parameter_cost,
     posterior,
@@ -120,8 +121,6 @@ def richer_model(
     Each additional parameter costs half a log n (:func:`parameter_cost`).
     """
     null, machine = estimate.statistics.pose_scale, session.machine
-    if null < POOR_MODEL_POSE_SCALE:
-        return None, ()
     count = int(measurements.poses.rows.sum())
     unknowns = machine.parameters.free_matrix().shape[1]
     scales, untested = dict[str, float](), list[Finding]()
@@ -142,7 +141,8 @@ def richer_model(
         more = other.parameters.free_matrix().shape[1] - unknowns
         if more > 0 and (other.n_legs == machine.n_legs or not len(measurements.edges)):
             cost = parameter_cost(more, count)
-            hypotheses.append(Hypothesis("machine.model", name, lambda _, to=other: to, cost))
+            if null > harmless_misfit(count, cost):
+                hypotheses.append(Hypothesis("machine.model", name, lambda _, to=other: to, cost))
     level = estimate_level(scale, null, count, VERDICT.too_noisy, failed)
     best = decide(posterior(hypotheses, [level]))
     if best is None:
@@ -295,11 +295,8 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Fin
             "chi2": axis.chi2,
             "dof": axis.dof,
         }
-        # Noise that is stated a little too small does not contradict a mechanism.
         if axis.tenable:
             out.append(note("poses.turning", name, **facts))
-        elif axis.chi2 > POOR_MODEL_POSE_SCALE**2 * axis.dof:
-            out.append(doubtful("poses.not_turning", name, **facts))
         else:
-            out.append(note("poses.turning_roughly", name, **facts))
+            out.append(doubtful("poses.not_turning", name, **facts))
     return out

@@ -20,6 +20,7 @@ from pkmcal.calibration.chance_matches import chance_match_reason
 from pkmcal.calibration.handheld import localize_case
 from pkmcal.calibration.refinement import RefinementResult, refine_alternating
 from pkmcal.identify.verdict import VERDICT
+from pkmcal.levels import NOISE_EXCESS
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.document import Leg
 from pkmcal.mechanisms.machine import machine_from_document
@@ -54,7 +55,7 @@ def explain_radii(
     prior = log_prior_of_each(case.session.machine, case.session.joints)
     # edges that scatter no more than those of right sessions need no hypothesis, the evidence for
     # which costs a localization and a refinement
-    least = max(harmless_misfit(n_effective, prior), VERDICT.edge_scatter)
+    least = max(harmless_misfit(n_effective, prior), NOISE_EXCESS)
     if not case.images or null <= least:
         return Explanation()
     inliers = 0.0 if turns is None else float(turns.estimate.edge_weights.sum())
