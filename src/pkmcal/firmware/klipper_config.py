@@ -29,7 +29,7 @@ import numpy as np
 from pkmcal.arrays import short_repr
 from pkmcal.errors import InputError, legible
 from pkmcal.files import LARGEST_WRITTEN_FILE, quoted, read_text
-from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE
+from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, printer_number
 
 SAVED_LINE_MARK = "#*#"
 FULL_STEPS = 200.0
@@ -81,18 +81,7 @@ class KlipperConfig:
                 f" {self.label}, if that has it",
             )
         text, where = self.entries[section][name]
-        try:
-            value = float(text)
-        except ValueError:
-            value = np.nan
-        if not abs(value) <= LARGEST_PRINTER_VALUE:
-            raise InputError(
-                f"{name} is no number that a printer can have",
-                where=where,
-                found=quoted(text),
-                expected="a number in mm, or degrees",
-            )
-        return value
+        return printer_number(text, name, where)
 
     def positive(self, section: str, name: str, default: float | None = None) -> float:
         """Number in a section that must be positive. Raises InputError otherwise."""

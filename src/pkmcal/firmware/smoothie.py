@@ -25,13 +25,12 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length, steps_correction
-from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
-    LARGEST_PRINTER_VALUE,
     TOWER_ANGLES,
     Firmware,
     Printer,
     WrittenValues,
+    printer_number,
 )
 from pkmcal.firmware.towers import (
     SettingNames,
@@ -200,16 +199,6 @@ def _config_words(text: str, label: str) -> Words:
     """Words of a file config. Raises InputError for values that are no numbers within bounds."""
     out: Words = {}
     for n, key, value in _config(text):
-        try:
-            number = float(value)
-        except ValueError:
-            number = np.nan
-        if not abs(number) <= LARGEST_PRINTER_VALUE:
-            raise InputError(
-                f"{key} is no number that a printer can have",
-                where=f"{label}, line {n}",
-                found=quoted(value),
-                expected="a number in mm, or degrees",
-            )
-        out[CONFIG_WORDS[key]] = number, f"{label}, line {n}"
+        where = f"{label}, line {n}"
+        out[CONFIG_WORDS[key]] = printer_number(value, key, where), where
     return out
