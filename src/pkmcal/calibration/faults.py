@@ -174,8 +174,8 @@ def noise_notes(
     if explained:
         return
     s, units = estimate.statistics, sorted(set(session.machine.joint_units))
-    if s.reading_scale != 1 and not _within(1.0, s.reading_range):
-        least, most = s.reading_range
+    least, most = s.reading_range
+    if s.reading_scale != 1 and not (least <= 1 and (most is None or most >= 1)):
         yield doubtful(
             "readings.noise",
             "session.yaml, joints.noise",
@@ -259,11 +259,6 @@ def scale_notes(session: Session, estimate: Estimate, named: tuple[str, ...]) ->
             sigmas=sigmas,
             each=each,
         )
-
-
-def _within(value: float, limits: tuple[float, float | None]) -> bool:
-    low, high = limits
-    return low <= value and (high is None or value <= high)
 
 
 def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Finding]:

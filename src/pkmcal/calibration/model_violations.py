@@ -25,7 +25,7 @@ from pkmcal.calibration.discrepancy_basis import (
     model_errors,
     with_discrepancy,
 )
-from pkmcal.calibration.tube_outlines import Outline, outlines
+from pkmcal.calibration.tube_outlines import outlines
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.discrepancy import discrepancy_of
 from pkmcal.identify.estimate import Estimate
@@ -197,8 +197,12 @@ def model_violations(
     if not value:
         return ModelViolations((), errors, estimate, discrepancy.random)
     fits = tests.fitted([k for k, _ in value])
-    last = len(fits) - len(tubes)
-    fits[last:] = [_tube_update(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
+    # the value of a tube is the median of its lines'
+    for k, one in enumerate(tubes, len(fits) - len(tubes)):
+        share = one.value / fits[k].value[0] if fits[k].value[0] else 0.0
+        fits[k] = OneStepUpdate(
+            np.array([one.value]), np.array([one.sigma]), fits[k].by_data * share
+        )
     violations = tuple(
         _detection(declared(k), score, fit, tool)
         for (k, score), fit in zip(value, fits, strict=True)
@@ -216,14 +220,6 @@ def tool_of(session: Session, estimate: Estimate) -> ToolAccuracy:
         estimate.state.T_base_platform[used],
         session.joints[used],
         legs_observed=estimate.edge_weights.size > 0,
-    )
-
-
-def _tube_update(fit: OneStepUpdate, one: Outline) -> OneStepUpdate:
-    """Update of a tube's violation with the value from the median of its lines."""
-    value, sigma = np.array([one.value]), np.array([one.sigma])
-    return OneStepUpdate(
-        value, sigma, fit.by_data * (one.value / fit.value[0] if fit.value[0] else 0.0)
     )
 
 

@@ -301,6 +301,7 @@ def calibrate_camera(
         for column in board_columns(board)
         if not (bend and column.code == "bend")
     )
+    middles = apply(fit.T_camera_board, views.points.mean(axis=0))
     calibration = CameraCalibration(
         camera=replace(fit.camera, covariance=covariance),
         terms=chosen.terms,
@@ -323,7 +324,7 @@ def calibrate_camera(
         detections=tuple(detections),
         bend=bent,
         deviations=deviations,
-        distance=distance or _median_distance(fit.T_camera_board, views.points),
+        distance=distance or float(np.median(np.linalg.norm(middles, axis=-1))),
         findings=(),
     )
     return replace(
@@ -374,12 +375,6 @@ def _bent_board(
         if np.all(np.abs(step.value) < NEGLIGIBLE * np.sqrt(np.diag(step.covariance))):
             break
     return fit, views, step._replace(value=value)
-
-
-def _median_distance(T_camera_board: Array, points: Array) -> float:
-    """Median distance of boards' middles from the camera, m."""
-    middles = apply(T_camera_board, points.mean(axis=0))
-    return float(np.median(np.linalg.norm(middles, axis=-1)))
 
 
 def _check_model_name(model: str) -> None:

@@ -140,7 +140,6 @@ def assess(
         *_readings_misfit(estimate, options),
         *_warnings(observation, estimate, options),
         *(_touch_unnoticed(bed, options) if bed else ()),
-        *_few_configurations(estimate, options),
         *(_not_by_heights(bed, identification, negligible) if bed else ()),
         *others,
         *(() if refused else undetermined),
@@ -430,6 +429,9 @@ def _warnings(
     shading = estimate.edge_noise.shading if observation.edges.leg.size else np.zeros(1)
     if shading.min() > POLISHED_SHADING:
         yield doubtful("edges.polished", value=float(shading.min()))
+    used = int(np.sum(estimate.configurations))
+    if used < options.few_configurations and not only_heights(estimate):
+        yield note("configurations.few", number=used)
 
 
 def _from_nominal(machine: Machine) -> Array:
@@ -442,10 +444,3 @@ def _from_nominal(machine: Machine) -> Array:
     frames = generators(machine.layout, table.nominal) @ freedoms(machine)
     frames = frames / table.tolerance[:, None]
     return change - frames @ np.linalg.lstsq(frames, change, rcond=None)[0]
-
-
-def _few_configurations(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
-    """Note if few configurations are in use."""
-    used = int(np.sum(estimate.configurations))
-    if used < options.few_configurations and not only_heights(estimate):
-        yield note("configurations.few", number=used)

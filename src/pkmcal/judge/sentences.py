@@ -379,7 +379,12 @@ def _change_verdict(
         return Verdict(False, headline, (wrong("watch.another_machine", **facts), *warnings))
     if not findings:
         headline = "The machine is not as calibrated."
-        return Verdict(False, headline, (_unidentified_finding(judged), *warnings))
+        legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
+        facts = {"chi2": judged.machine.chi2, "dof": judged.machine.dof}
+        unidentified = wrong("watch.machine_test_fails", **facts)
+        if legs:
+            unidentified = wrong("watch.leg_test_fails", _leg_names(legs), legs=_leg_names(legs))
+        return Verdict(False, headline, (unidentified, *warnings))
     lens = all(f.suspect.cause.part == "camera" for f in findings)
     if lens:
         headline = (
@@ -430,14 +435,6 @@ def _cause_finding(value: Explanation, place: int, names: Names) -> Finding:
     if cause.part in ("zero", "lead", "camera"):
         return wrong(f"watch.{cause.part}", subject, **facts)
     return wrong("watch.part", subject, **facts)
-
-
-def _unidentified_finding(judged: ChangeTests) -> Finding:
-    """Finding of a change without an identified cause."""
-    legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
-    if legs:
-        return wrong("watch.leg_test_fails", _leg_names(legs), legs=_leg_names(legs))
-    return wrong("watch.machine_test_fails", chi2=judged.machine.chi2, dof=judged.machine.dof)
 
 
 def _next_step(findings: Sequence[Explanation]) -> Finding:
