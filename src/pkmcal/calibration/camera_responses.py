@@ -44,9 +44,12 @@ from pkmcal.wording import listed
 RESPONSE_TEST_CONFIGURATIONS = 6
 """Configurations of a camera whose images are tested first: with painted legs their hundred and
 fifty edges show a wrong response by six standard deviations."""
-LEAST_RESPONSE_GAIN, MOST_TURN_DEVIATION = 2.7, 0.1
-"""chi2 from which all images are measured by the other response, by chance in one session of ten;
-and the standard deviation of the change from which few images do not determine it."""
+LEAST_RESPONSE_GAIN = 2.7
+"""chi2 from which all images are measured by the other response, by chance in one session of
+ten."""
+MOST_TURN_DEVIATION = (2 * OPTIONS.act) ** -0.5
+"""Standard deviation of the change from which few images do not determine it: with a smaller one
+the odds between no change and a whole one, 0 and 1, are those of an act."""
 _Camera = tuple[str, Response]
 """A camera's file, and the usual response of its images' kind."""
 

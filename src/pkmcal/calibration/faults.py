@@ -19,6 +19,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.identify.verdict import VERDICT, RicherModel
+from pkmcal.levels import MAJORITY, OUTLIER_SIGMAS
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
@@ -36,14 +37,9 @@ from pkmcal.outcome.hypotheses import (
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
-UNTOLD_BOARD_SIZE_SIGMA = 0.7
-"""Share of the prior sigma of a board's size from which its sigma is due to the file rather than to
-the data."""
 BOARD_SIZE_DISAGREEMENT = 2.0
 """Standard deviations between a board's size by its file and by all other data from which a note
 reports both: by chance one session of twenty."""
-WRONG_SCALE_DEVIATIONS = 3.0
-"""Standard deviations from the nominal scale of a reading from which a note reports it."""
 WRONG_MODEL_READING_SCALE = 100.0
 """Factor on the readings' stated noise from which the scatter is a model error: mounted encoders
 are ten or thirty times as noisy as their data sheets."""
@@ -218,7 +214,8 @@ def size_notes(
         strict=False,
     ):
         file = session.document["board"]["file"]
-        if sigma <= UNTOLD_BOARD_SIZE_SIGMA * tolerance:
+        # most of the information is the data's rather than the file's
+        if sigma**2 <= MAJORITY * tolerance**2:
             yield note("board.size_estimate", file, value=value, sigma=sigma)
             continue
         # without the prior, which is the file's, the estimate is that of all other data
@@ -242,7 +239,7 @@ def scale_notes(session: Session, estimate: Estimate, named: tuple[str, ...]) ->
         name = session.document["joints"]["columns"][column]
         share = float(estimate.machine.values[k] / table.nominal[k] - 1)
         sigma = float(np.sqrt(estimate.covariance[k, k]))
-        if abs(share) > WRONG_SCALE_DEVIATIONS * sigma > 0 and name not in named:
+        if abs(share) > OUTLIER_SIGMAS * sigma > 0 and name not in named:
             results[name] = share, sigma
     if results:
         values, sigmas = zip(*results.values(), strict=True)

@@ -29,8 +29,6 @@ from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.hypotheses import OPTIONS, Hypothesis, Ranked, decide
 from pkmcal.session.load import Session
 
-FURTHER_THAN_TURNED = 1.5
-"""Multiple of the change beyond which the estimate is neither camera, though one is nearer."""
 USUAL_CENTRE_ERROR = 1.5
 """Prior sigma (px) of a calibrated camera's principal point along the change, where its file states
 none."""
@@ -138,7 +136,8 @@ def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
         return 0.0
     mean = float(weight @ value / weight.sum())
     variance = float(1 / weight.sum()) + file_sigma**2
-    return (2 * mean - 1) / (2 * variance) if mean < FURTHER_THAN_TURNED else 0.0
+    # beyond 1 by more than the middle between 0 and 1 is below it, the camera is a third one
+    return (2 * mean - 1) / (2 * variance) if mean - 1 < 1 / 2 else 0.0
 
 
 def turned_round(session: Session, cameras: Mapping[str, Camera]) -> Session:

@@ -27,7 +27,7 @@ from pkmcal.boards.fit import (
 )
 from pkmcal.cameras.contract import CENTER, FOCAL, Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
-from pkmcal.levels import NEGLIGIBLE
+from pkmcal.levels import NEGLIGIBLE, UNEXPLAINED_SCALE
 from pkmcal.ranges import CameraModelChoice
 from pkmcal.solver.elimination import eliminate
 from pkmcal.solver.kernels import INLIER_WEIGHT, NO_WEIGHT_DISTANCE
@@ -64,7 +64,7 @@ class ModelSelectionOptions:
     least_of_view: int = 12
     # ratio of residuals to another model's, with so many radial terms, above which no more terms
     # are tried
-    hopeless_ratio: float = 5.0
+    hopeless_ratio: float = UNEXPLAINED_SCALE
     hopeless_terms: int = 2
     # median residual, px, up to which a model is not hopeless: tangential terms alone may be
     # missing, of which sharp images show hundredths of a pixel

@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.levels import NOISE_EXCESS
+from pkmcal.levels import FALSE_ALARM, NOISE_EXCESS
 
 
 class Search(StrEnum):
@@ -38,8 +38,8 @@ class FalseAlarm:
     """Level of a session, and the searches that share it."""
 
     # chance that a session that agrees with its model shows any named violation, any discrepancy,
-    # or any measured pose that disagrees with all others: one session of two hundred
-    level: float = 0.005
+    # or any measured pose that disagrees with all others
+    level: float = FALSE_ALARM
     # share of the level that each search has
     shares: Mapping[Search, float] = field(default_factory=lambda: EQUAL_SHARES)
 

@@ -23,7 +23,9 @@ from pkmcal.levels import (
     CONTRADICTION_SIGMAS,
     FEW,
     MAJORITY,
+    NEGLIGIBLE,
     ROUNDING,
+    UNEXPLAINED_SCALE,
 )
 from pkmcal.measurements import OWN_SHADING, Observation
 from pkmcal.mechanisms import Machine
@@ -47,7 +49,7 @@ class VerdictOptions:
     """Limits of a result that may be used."""
 
     # noise scale beyond which the model does not explain the measurements
-    too_noisy: float = 4.0
+    too_noisy: float = UNEXPLAINED_SCALE
     # share of rejected edges beyond which the remaining ones may be the outliers
     too_many_rejected: float = 0.4
     # share of the platform's error by the nominal model that may remain undetermined. A calibration
@@ -69,9 +71,9 @@ class VerdictOptions:
     # risk
     nominal_error_share: float = 0.5
     # residual of a reading, in standard deviations, beyond which it contradicts the images, and the
-    # share of such readings that is a reason: two in a billion normal errors are so large
-    reading_residual: float = 6.0
-    contradicted_share: float = 0.02
+    # share of such readings that is a reason
+    reading_residual: float = CONTRADICTION_SIGMAS
+    contradicted_share: float = NEGLIGIBLE
     # edges of a leg, relative to the median of all legs, below which the leg is seldom in view
     few_edges_share: float = FEW
     # configurations below which a note says that they are few
