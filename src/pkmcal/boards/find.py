@@ -23,6 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.circles import LEAST_WINDOW_RADIUS, circle_centres, find_circles
+from pkmcal.levels import NEARLY_ALL
 from pkmcal.solver.marquardt import Damping
 from pkmcal.solver.ranks import column_space
 
@@ -51,7 +52,7 @@ class BoardDetectionOptions:
     # px by which an edge may leave its tangent within the window before its bend is modelled
     straight: float = 0.02
     # share of the blank border between edge and marker that the window may fill
-    blank_share: float = 0.9
+    blank_share: float = NEARLY_ALL
     # corners below which an image says nothing: four fix a board's pose, two more test it
     # (derived)
     least_corners: int = 6

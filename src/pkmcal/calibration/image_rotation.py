@@ -136,7 +136,7 @@ def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
         return 0.0
     mean = float(weight @ value / weight.sum())
     variance = float(1 / weight.sum()) + file_sigma**2
-    # beyond 1 by more than the middle between 0 and 1 is below it, the camera is a third one
+    # further beyond 1 than the middle between 0 and 1 is before it: neither camera
     return (2 * mean - 1) / (2 * variance) if mean - 1 < 1 / 2 else 0.0
 
 

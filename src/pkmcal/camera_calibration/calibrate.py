@@ -48,7 +48,14 @@ from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, json_value
 from pkmcal.geometry.rigid import apply, dot
-from pkmcal.levels import FALSE_ALARM, MAJORITY, NEGLIGIBLE, OUTLIER_SIGMAS, UNEXPLAINED_SCALE
+from pkmcal.levels import (
+    FALSE_ALARM,
+    MAJORITY,
+    NEARLY_ALL,
+    NEGLIGIBLE,
+    OUTLIER_SIGMAS,
+    UNEXPLAINED_SCALE,
+)
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.solver.kernels import INLIER_WEIGHT
@@ -91,7 +98,7 @@ class CalibrationCheckOptions:
 CALIBRATION_CHECK_OPTIONS = CalibrationCheckOptions()
 UNCERTAINTY_CELLS = (32, 24)
 """Columns and rows of cells in which the projection's uncertainty is computed."""
-STRONG_CORRELATION = 0.95
+STRONG_CORRELATION = NEARLY_ALL**0.5
 """Correlation from which two intrinsics are reported as hardly separable."""
 
 

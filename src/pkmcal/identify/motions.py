@@ -66,9 +66,9 @@ class UnidentifiedOptions:
     sparse_steps: int = 20
     frame_weight: float = 10.0
 
-    # sine of the angle to the motions so far below which a motion describes nothing new. What no
-    # motion describes is reported in one sentence, so larger angles must count
-    new_sine: float = 0.1
+    # sine of the angle to the motions so far below which a motion describes nothing new: the share
+    # of its square that is new is negligible
+    new_sine: float = NEGLIGIBLE**0.5
 
 
 UNIDENTIFIED = UnidentifiedOptions()

@@ -63,11 +63,13 @@ SEARCH_OPTIONS = HypothesisOptions(beam=math.inf, most=3)
 OTHER_EXPLANATIONS = 4
 """Explanations of images beside those of the readings: shifted, under other names, mirrored,
 diameters for radii."""
-NEAR_SEARCH_TURN = np.radians(15.0)
-"""Turn from the pose by hand beyond which hypotheses are searched about that pose, too."""
-OTHER_POSE_TURN = np.radians(45.0)
-"""Turn from the pose by hand beyond which the localized pose contradicts it: a machine of three or
-six equal parts looks the same from there."""
+NEAR_SEARCH_TURN = LOCALIZATION_OPTIONS.far.turn
+"""Turn from the pose by hand beyond which hypotheses are searched about that pose, too: the
+standard deviation of poses by hand."""
+OTHER_POSE_TURN = np.radians(60.0) - NEAR_SEARCH_TURN
+"""Turn from the pose by hand beyond which the localized pose contradicts it: a machine of six equal
+parts looks the same from 60 degrees aside, and poses by hand are off by their standard
+deviation."""
 NAMING_ROUNDS = 3
 """Rounds of names for images, and of the pose by these names."""
 CONSTANTS_COMPARED = 17
