@@ -190,7 +190,7 @@ def test_what_is_exported_has_the_bed_at_zero_and_the_size_right(kit, true):
     assert abs(np.mean(z)) < 0.015
 
 
-@pytest.mark.parametrize(("error", "code"), [(0.06, "links.scatter"), (0.3, "links.misfit")])
+@pytest.mark.parametrize(("error", "code"), [(0.06, "data.scatter"), (0.3, "data.misfit")])
 def test_distances_that_disagree_with_the_machine(kit, tmp_path, error, code):
     """Further errors (mm) of distances whose stated noise is 0.03 mm."""
     shutil.copytree(kit, tmp_path / "kit")
@@ -201,8 +201,9 @@ def test_distances_that_disagree_with_the_machine(kit, tmp_path, error, code):
     wrong = [f"{ends},{float(value) + error * rng.normal():.3f}" for ends, value in values]
     table.write_text("\n".join([head, *wrong]) + "\n")
     verdict = calibrate_session(tmp_path / "kit").verdict
-    assert [one.code for one in verdict.of("links")] == [code]
-    assert verdict.usable == (code == "links.scatter")
+    (misfit,) = verdict.of("data")
+    assert (misfit.code, misfit.facts["names"]) == (code, ["distances"])
+    assert verdict.usable == (code == "data.scatter")
 
 
 def test_held_out_configurations_take_their_distances_with_them(measured):

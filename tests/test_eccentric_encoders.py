@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.model_violations import TESTED, model_violations
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.score import ScoreTests
+from pkmcal.session.load import load_session
 from test_pose_sessions import make, write_joints
 
 
@@ -53,3 +57,27 @@ def test_a_scale_that_the_data_separate_is_named_alone(tmp_path):
     write_joints(made.folder, readings)
     (one,) = calibrate_session(made.folder).violations
     assert (one.code, one.of, one.rivals) == ("readings.scale", "motor2", ())
+
+
+def test_one_that_is_refuted_leaves_the_stated_covariance(tmp_path):
+    """A model too poor for an H4: one is likeliest first, and not beside smooth errors."""
+    folder = tmp_path / "session"
+    make(folder, "h4", n=40, seed=1)
+    document = (folder / "session.yaml").read_text().replace("mechanism.yaml", "h4")
+    (folder / "session.yaml").write_text(document)
+    result = calibrate_session(load_session(folder, "design"))
+    estimate = bundle(result.session.machine, result.measurements, result.estimate.state)
+    data = result.session, result.observation, result.measurements, estimate
+    families = {family: list(family(*data)) for family in TESTED}
+    others = [
+        family
+        for family, columns in families.items()
+        if all(one.code != "readings.eccentric" for one in columns)
+    ]
+    columns = [one for family in families.values() for one in family]
+    first = ScoreTests(*estimate.linearized, columns).significant()[0][0]
+    assert columns[first].code == "readings.eccentric"
+    with_it, without = (model_violations(*data, tested) for tested in (TESTED, others))
+    assert [one.code for one in with_it.errors] == ["readings.workspace"]
+    assert with_it.violations == ()
+    np.testing.assert_allclose(with_it.estimate.covariance, without.estimate.covariance, rtol=1e-9)

@@ -70,7 +70,7 @@ def test_a_session_gives_a_false_alarm_at_most_at_its_level():
             bool(estimated.scales),
             tubes.min() < level.of_test(Search.OUTLINES, 15),
             level.adjusted(Search.OUTLIERS, poses.min(), 15) < LEVEL,
-            noise > level.scale(Search.POSE_NOISE, 39),
+            noise > level.scale(Search.NOISE, 39),
             camera > level.scale(Search.INTRINSICS, 39),
         )
     most = LEVEL * SESSIONS
@@ -99,9 +99,9 @@ def test_every_search_that_uses_the_level_has_a_share_of_it():
 
 @pytest.mark.parametrize("dof", [5, 60])
 def test_noise_exceeds_its_scale_as_often_as_the_level_states(dof):
-    level, runs = FalseAlarm(0.02, {Search.POSE_NOISE: 0.5}), 20000
+    level, runs = FalseAlarm(0.02, {Search.NOISE: 0.5}), 20000
     rng = np.random.default_rng(0)
     rms = np.sqrt(np.mean(rng.normal(size=(runs, dof)) ** 2, axis=1))
-    assert np.mean(rms > level.scale(Search.POSE_NOISE, dof)) == pytest.approx(
+    assert np.mean(rms > level.scale(Search.NOISE, dof)) == pytest.approx(
         0.01, abs=4 * np.sqrt(0.01 / runs)
     )

@@ -184,17 +184,21 @@ def test_templates(template, facts, text):
 
 def test_a_verdict_has_findings_by_level_and_their_document():
     few = note("configurations.few", number=4)
-    misfit = wrong("edges.misfit", scale=12.5)
-    verdict = Verdict(False, "No.", (misfit, doubtful("edges.scatter", scale=2.0), few))
-    assert verdict.codes == ("edges.misfit", "edges.scatter", "configurations.few")
-    assert [one.code for one in verdict.of("edges")] == ["edges.misfit", "edges.scatter"]
-    assert (verdict.reasons, verdict.advice) == ((misfit.text,), (few.text,))
+    rare = wrong("edges.leg_seldom_seen", leg=3)
+    verdict = Verdict(False, "No.", (rare, doubtful("edges.polished", value=0.1), few))
+    assert verdict.codes == ("edges.leg_seldom_seen", "edges.polished", "configurations.few")
+    assert [one.code for one in verdict.of("edges")] == ["edges.leg_seldom_seen", "edges.polished"]
+    assert (verdict.reasons, verdict.advice) == ((rare.text,), (few.text,))
     assert len(verdict.warnings) == 1
     document = verdict.document()
-    assert document["reasons"] == (misfit.text,)
+    assert document["reasons"] == (rare.text,)
     first = document["findings"][0]
-    assert (first["code"], first["level"], first["text"]) == ("edges.misfit", "wrong", misfit.text)
-    assert first["facts"] == {"scale": 12.5}
+    assert (first["code"], first["level"], first["text"]) == (
+        "edges.leg_seldom_seen",
+        "wrong",
+        rare.text,
+    )
+    assert first["facts"] == {"leg": 3}
 
 
 def test_an_error_is_a_finding_under_its_code():

@@ -53,7 +53,7 @@ def test_a_tower_that_leans_is_named_with_the_model_that_frees_it(tracked):
     assert (one.code, one.of, one.finding.level) == ("machine.lean", "leg 2", Level.DOUBTFUL)
     assert one.finding.facts["value"] == pytest.approx(LEAN, abs=4 * one.finding.facts["sigma"])
     assert one.finding.facts["sigma"] < LEAN / 5
-    (misfit,) = result.verdict.of("poses.misfit")
+    (misfit,) = result.verdict.of("data.misfit")
     assert misfit.facts["model"] == "leaning"
 
 

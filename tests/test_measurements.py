@@ -17,6 +17,8 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import start_state
+from pkmcal.identify.verdict import misfit
+from pkmcal.levels import UNEXPLAINED_SCALE
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.measurements.contract import (
     DISPLAY_UNITS,
@@ -29,6 +31,7 @@ from pkmcal.measurements.contract import (
 )
 from pkmcal.measurements.distances import DistanceSet
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.outcome import Level
 from pkmcal.session.schema import OBSERVE_WORDS, session_schema
 from test_identify_scene import make_scene
 
@@ -267,3 +270,19 @@ def test_an_estimate_that_starts_at_exact_data_ends_there(example):
     estimate = bundle(machine, data, start, robust=False, scale_noise=False)
     assert estimate.statistics.chi2 < 1e-3
     np.testing.assert_allclose(estimate.machine.values, machine.values, atol=1e-6)
+
+
+def test_data_of_every_kind_are_judged_by_their_group(example):
+    """A noise scale far beyond the limit is a reason, under the kind's name."""
+    kind, machine, data, start, _, _ = example
+    estimate = bundle(machine, data, start, robust=False, scale_noise=False)
+    groups = {group.name: group for group in estimate.statistics.groups}
+    assert groups[kind.rows].n > 0
+    if kind.rows not in estimate.weights:  # readings, whose noise the data give
+        return
+    scale = {"edges": "noise_scale", "poses": "pose_scale", "links": "link_scale"}[kind.rows]
+    statistics = replace(estimate.statistics, **{scale: 2 * UNEXPLAINED_SCALE})
+    (one,) = misfit(replace(estimate, statistics=statistics), {kind.rows: [kind.label]})
+    assert (one.code, one.level, one.subject) == ("data.misfit", Level.WRONG, kind.label)
+    assert kind.label in one.text
+    assert not [*misfit(estimate)]

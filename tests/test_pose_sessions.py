@@ -273,7 +273,7 @@ def test_a_model_too_poor_is_refused_and_the_richer_one_named(folder):
     (folder / "session.yaml").write_text(document)
     poor = calibrate_session(load_session(folder, "design"))
     assert not poor.verdict.usable
-    (misfit,) = poor.verdict.of("poses.misfit")
+    (misfit,) = poor.verdict.of("data.misfit")
     assert misfit.facts["model"] == "calibration"
     rich = calibrate_session(load_session(folder, "calibration"))
     assert rich.verdict.usable

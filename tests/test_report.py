@@ -86,7 +86,11 @@ def test_the_row_of_chi2_is_of_the_noise_as_stated(case):
         s, chi2=1040.0, chi2_edges=940.0, chi2_joints=60.0, chi2_drawing=40.0, chi2_poses=0.0,
         dof=1000.0, noise_scale=7.0, pose_scale=1.0, reading_scale=1.0,
     )  # fmt: skip
-    refused = Verdict(False, "Not to be used.", (wrong("edges.misfit", scale=5.0),))
+    refused = Verdict(
+        False,
+        "Not to be used.",
+        (wrong("data.misfit", group="edges", names=["edges"], scale=5.0),),
+    )
     estimate = replace(case.estimate, statistics=noisy)
     value = report_of(calibration(case.session, case.observation, estimate, refused))
     (card,) = (card for card in value.figures if card.question.startswith("Does the model"))

@@ -125,7 +125,10 @@ def test_findings_without_effect_are_remarks(case):
 @pytest.mark.parametrize(
     ("finding", "question"),
     [
-        (wrong("edges.rejected_share", share=0.5, limit=0.4), DATA_QUESTION),
+        (
+            wrong("data.rejected_share", names=["edges"], share=0.5, limit=0.4),
+            DATA_QUESTION,
+        ),
         (doubtful("machine.undetermined", what="Open.", advice="More."), TOOL_QUESTION),
     ],
 )

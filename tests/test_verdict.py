@@ -147,8 +147,8 @@ def test_the_limits_of_a_verdict_are_its_options(whole):
     assert "configurations.few" not in codes(few_configurations=used)
     assert "configurations.few" in codes(few_configurations=used + 1)
     scale = estimate.statistics.noise_scale
-    assert "edges.misfit" not in codes(too_noisy=scale)
-    assert "edges.misfit" in codes(too_noisy=np.nextafter(scale, 0))
+    assert "data.misfit" not in codes(too_noisy=scale)
+    assert "data.misfit" in codes(too_noisy=np.nextafter(scale, 0))
 
 
 def test_light_that_moves_single_edges_is_warned_of(whole):

@@ -34,6 +34,15 @@ CONTRADICTION_SIGMAS = 5.0
 NOISE_EXCESS = 1.5
 """Ratio of errors to their standard deviations that is no reason for a report: standard deviations
 contain noise, and shading and lenses add a few tenths in any images."""
+UNEXPLAINED_SCALE = 4.0
+"""Ratio of errors to their noise beyond which a model does not explain them; up to it standard
+deviations are enlarged by the ratio."""
+FALSE_ALARM = 0.005
+"""Chance that a test of data that agree with their model finds anything: one session of two
+hundred."""
+OTHER_UNIT_RATIO = 10.0
+"""Ratio of two lengths beyond which one is in another unit: inches for millimetres make 25.4, and
+no nominal model is wrong by a factor of ten."""
 LARGEST_NOMINAL_ERROR = 10.0
 """Largest error of a nominal model, in prior sigmas, which a file may state too small: beyond it
 the model is another machine's, or the readings are wrong."""

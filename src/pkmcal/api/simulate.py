@@ -155,7 +155,10 @@ def simulate(
     given: dict[str, Any] = {"sensor": Sensor(blur=blur, read_noise=noise), **settings}
     _check_settings({**given, "noise": noise, "blur": blur, "seed": seed})
     planned = None if plan is None else rehearsal_of(plan)
-    nominal = planned.machine if planned else _nominal(mechanism)
+    if planned:
+        nominal = planned.machine
+    else:
+        nominal = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
     # errors are located at the plan, at the mechanism's file or at the machine's name
     source = mechanism if plan is None else plan
     machine = to_simulate(nominal, nominal.name if isinstance(source, Machine) else str(source))
@@ -178,11 +181,6 @@ def simulate(
         )
         session = load_session(folder)
     return SimulationResult.of(session, truth=truth, cylinders_added=machine is not nominal)
-
-
-def _nominal(mechanism: Machine | Path | str) -> Machine:
-    """Machine as given, or by its name or file."""
-    return mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
 
 
 def _camera(camera: Camera | Path | str | tuple[int, int] | None) -> Camera:

@@ -10,20 +10,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import pi
 from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board
+from pkmcal.levels import CONTRADICTION_SIGMAS
+
+LEAST_WINDOW_RADIUS = 2.5
+"""Smallest radius, px, of what is measured on a board: a smaller window holds too few pixels for
+the seven unknowns of a corner."""
 
 
 @dataclass(frozen=True)
 class CircleOptions:
     """Constants of the detection of circles."""
 
-    # least area of a circle, px: a smaller one has no inside
-    least_area: float = 20.0
+    # least area of a circle, px: that of the smallest window of a corner, which a smaller one's
+    # blur fills
+    least_area: float = pi * LEAST_WINDOW_RADIUS**2
     # neighbours, the circle included, of which the homography of a circle is fitted
     neighbours: int = 9
     # samples across a circle's surroundings in the board's plane
@@ -32,10 +39,8 @@ class CircleOptions:
     passes: int = 3
     # inner edge of the ring of paper around a circle, as a share of half the distance to the next
     ring: float = 0.85
-    # least difference between circle and paper, grey levels, and in standard deviations of the
-    # paper
-    least_contrast: float = 15.0
-    least_contrast_sigmas: float = 4.0
+    # least difference between circle and paper, in standard deviations of the paper
+    least_contrast: float = CONTRADICTION_SIGMAS
 
 
 CIRCLE_OPTIONS = CircleOptions()
@@ -132,7 +137,7 @@ def _centre(
     # bilinear interpolation leaves two thirds of the pixels' standard deviation, on average
     level, noise = float(np.median(paper)), 1.5 * float(np.std(paper))
     contrast = level - float(np.median(grey[radius < 0.2]))
-    if abs(contrast) < max(options.least_contrast, options.least_contrast_sigmas * noise):
+    if not abs(contrast) > options.least_contrast * noise:
         return None
     share = np.where(radius <= 1, (level - grey) / contrast, 0.0)
     total = float(share.sum())

@@ -22,7 +22,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
-from pkmcal.boards.circles import circle_centres, find_circles
+from pkmcal.boards.circles import LEAST_WINDOW_RADIUS, circle_centres, find_circles
+from pkmcal.levels import NEARLY_ALL
 from pkmcal.solver.marquardt import Damping
 from pkmcal.solver.ranks import column_space
 
@@ -35,8 +36,8 @@ class BoardDetectionOptions:
     steps: int = 12
     # step at which a corner has settled, px: a thirtieth of what the noise of a good image does
     settled: float = 1e-3
-    # smallest radius of a window, px: a smaller window holds too few pixels for seven unknowns
-    least_radius: float = 2.5
+    # smallest radius of a window, px
+    least_radius: float = LEAST_WINDOW_RADIUS
     # largest radius of a window, px: lines bend in a larger one
     most_radius: int = 14
     # range of the blur, px; outside, the window shows something other than a corner
@@ -51,7 +52,7 @@ class BoardDetectionOptions:
     # px by which an edge may leave its tangent within the window before its bend is modelled
     straight: float = 0.02
     # share of the blank border between edge and marker that the window may fill
-    blank_share: float = 0.9
+    blank_share: float = NEARLY_ALL
     # corners below which an image says nothing: four fix a board's pose, two more test it
     # (derived)
     least_corners: int = 6

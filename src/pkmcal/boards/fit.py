@@ -223,7 +223,10 @@ def fit_camera(
         off = _off(with_free(camera, free, state), state, views)
         dof = max(2 * weight.sum() - 6 * len(in_view) - len(free), 1.0)
         new_tau = noise_beyond(off, views.sigma, weight, dof)
-        robust = _robust_scale(off, views.sigma, in_view)
+        # tau from the median of the residuals' lengths
+        middle = float(np.median(np.sum(off[in_view] ** 2, axis=-1))) / MEDIAN_LENGTH**2
+        beyond_noise = middle - float(np.median(views.sigma[in_view] ** 2))
+        robust = float(np.sqrt(max(beyond_noise, LEAST_NOISE**2)))
         distance = np.sum(np.nan_to_num(off) ** 2, axis=-1) / (views.sigma**2 + (robust * cut) ** 2)
         new_weight = np.where(in_view, final_weights(np.sqrt(distance)), 0.0)
         change = np.abs(new_weight - weight).max(initial=0.0)
@@ -356,12 +359,6 @@ def _off(camera: Camera, state: CameraState, views: Views) -> Array:
     off = camera.project(apply(state.T_camera_board[0][:, None], views.points)) - views.pixels
     lost = views.visible[..., None] & ~np.isfinite(off)
     return np.where(lost, 1e3, off)
-
-
-def _robust_scale(off: Array, sigma: Array, visible: Booleans) -> float:
-    """Tau from the median of the residuals' lengths, px."""
-    middle = float(np.median(np.sum(off[visible] ** 2, axis=-1))) / MEDIAN_LENGTH**2
-    return float(np.sqrt(max(middle - float(np.median(sigma[visible] ** 2)), LEAST_NOISE**2)))
 
 
 class BoardPoses(NamedTuple):

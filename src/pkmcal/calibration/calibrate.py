@@ -539,6 +539,7 @@ def _judge(
         value.estimate,
         identification,
         method,
+        labels=session.labels,
         richer=value.richer,
         explained=explains_heights(errors),
         others=others,

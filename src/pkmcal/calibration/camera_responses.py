@@ -45,9 +45,12 @@ from pkmcal.wording import listed
 RESPONSE_TEST_CONFIGURATIONS = 6
 """Number of configurations of a camera whose images are tested first: with painted legs their
 hundred and fifty edges detect a wrong response at six standard deviations."""
-LEAST_RESPONSE_GAIN, MOST_TURN_DEVIATION = 2.7, 0.1
+LEAST_RESPONSE_GAIN = 2.7
 """Decrease of chi2 above which all images are measured by the other response (exceeded by chance in
-one session of ten), and standard deviation of the change above which few images do not decide."""
+one session of ten)."""
+MOST_TURN_DEVIATION = (2 * OPTIONS.act) ** -0.5
+"""Standard deviation of the change above which few images do not decide: with a smaller one the
+odds between no change and a whole one, 0 and 1, are those of an act."""
 _Camera = tuple[str, Response]
 """A camera's file, and the usual response of its kind of image file."""
 

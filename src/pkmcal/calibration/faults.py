@@ -19,8 +19,8 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import only_heights
-from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, VERDICT, RicherModel
-from pkmcal.levels import NOISE_EXCESS
+from pkmcal.identify.verdict import VERDICT, RicherModel
+from pkmcal.levels import MAJORITY, NOISE_EXCESS, OUTLIER_SIGMAS
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
@@ -30,6 +30,7 @@ from pkmcal.outcome.hypotheses import (
     Hypothesis,
     decide,
     estimate_level,
+    harmless_misfit,
     log_likelihood,
     parameter_cost,
     posterior,
@@ -38,14 +39,9 @@ from pkmcal.session.load import Session
 from pkmcal.session.readings import rounding_step
 from pkmcal.wording import listed
 
-UNTOLD_BOARD_SIZE_SIGMA = 0.7
-"""Ratio of the posterior to the prior sigma of a board's size above which the size is determined by
-the file rather than by the data."""
 BOARD_SIZE_DISAGREEMENT = 2.0
 """Standard deviations between a board's size by its file and by all other data from which a note
 reports both: by chance one session of twenty."""
-WRONG_SCALE_DEVIATIONS = 3.0
-"""Standard deviations from the nominal scale of a reading from which a note reports it."""
 WRONG_MODEL_READING_SCALE = 100.0
 """Factor on the readings' stated noise above which the scatter is a model error: mounted encoders
 are ten or thirty times as noisy as in their data sheets."""
@@ -141,8 +137,6 @@ def richer_model(
     costs half a log n (:func:`parameter_cost`).
     """
     null, machine = estimate.statistics.pose_scale, session.machine
-    if null < POOR_MODEL_POSE_SCALE:
-        return None, ()
     count = int(measurements.poses.rows.sum())
     unknowns = machine.parameters.free_matrix().shape[1]
     scales, untested = dict[str, float](), list[Finding]()
@@ -163,7 +157,8 @@ def richer_model(
         more = other.parameters.free_matrix().shape[1] - unknowns
         if more > 0 and (other.n_legs == machine.n_legs or not len(measurements.edges)):
             cost = parameter_cost(more, count)
-            hypotheses.append(Hypothesis("machine.model", name, lambda _, to=other: to, cost))
+            if null > harmless_misfit(count, cost):
+                hypotheses.append(Hypothesis("machine.model", name, lambda _, to=other: to, cost))
     level = estimate_level(scale, null, count, VERDICT.too_noisy, failed)
     best = decide(posterior(hypotheses, [level]))
     if best is None:
@@ -196,8 +191,8 @@ def noise_notes(
     if explained:
         return
     s, units = estimate.statistics, sorted(set(session.machine.joint_units))
-    if s.reading_scale != 1 and not _within(1.0, s.reading_range):
-        least, most = s.reading_range
+    least, most = s.reading_range
+    if s.reading_scale != 1 and not (least <= 1 and (most is None or most >= 1)):
         noise = session.joint_noise * s.reading_scale
         yield doubtful(
             "readings.noise",
@@ -242,7 +237,8 @@ def size_notes(
         strict=False,
     ):
         file = session.document["board"]["file"]
-        if sigma <= UNTOLD_BOARD_SIZE_SIGMA * tolerance:
+        # most of the information is the data's rather than the file's
+        if sigma**2 <= MAJORITY * tolerance**2:
             yield note("board.size_estimate", file, value=value, sigma=sigma)
             continue
         # the prior, which is the file's, is removed: 1 / other is the factor on the estimate
@@ -266,7 +262,7 @@ def scale_notes(session: Session, estimate: Estimate, named: tuple[str, ...]) ->
         name = session.document["joints"]["columns"][column]
         share = float(estimate.machine.values[k] / table.nominal[k] - 1)
         sigma = float(np.sqrt(estimate.covariance[k, k]))
-        if abs(share) > WRONG_SCALE_DEVIATIONS * sigma > 0 and name not in named:
+        if abs(share) > OUTLIER_SIGMAS * sigma > 0 and name not in named:
             results[name] = share, sigma
     if results:
         values, sigmas = zip(*results.values(), strict=True)
@@ -283,11 +279,6 @@ def scale_notes(session: Session, estimate: Estimate, named: tuple[str, ...]) ->
             sigmas=sigmas,
             each=each,
         )
-
-
-def _within(value: float, limits: tuple[float, float | None]) -> bool:
-    low, high = limits
-    return low <= value and (high is None or value <= high)
 
 
 def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Finding]:
@@ -319,11 +310,8 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Fin
             "chi2": axis.chi2,
             "dof": axis.dof,
         }
-        # Noise that is stated a little too small does not contradict a mechanism.
         if axis.tenable:
             out.append(note("poses.turning", name, **facts))
-        elif axis.chi2 > POOR_MODEL_POSE_SCALE**2 * axis.dof:
-            out.append(doubtful("poses.not_turning", name, **facts))
         else:
-            out.append(note("poses.turning_roughly", name, **facts))
+            out.append(doubtful("poses.not_turning", name, **facts))
     return out

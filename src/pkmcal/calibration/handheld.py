@@ -14,6 +14,7 @@ joint estimate rejects: their pose was wrong.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -42,6 +43,7 @@ from pkmcal.observe.pose_candidates import SAME_POSE_TURN, same_pose
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.outcome.finding import Finding, note
+from pkmcal.outcome.hypotheses import OPTIONS as DECISIONS
 from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
@@ -58,7 +60,7 @@ class HandheldOptions:
     """Constants of the localization of hand-held images."""
 
     # largest probability that any image of a session is accepted with a wrong pose (statistical)
-    misplaced: float = 0.05
+    misplaced: float = math.exp(-DECISIONS.report)
     # number of an image's best poses that are always scored again when the machine is known better,
     # whatever their score by the image alone, because a wrong pose corrupts the estimate
     scored_again: int = 4

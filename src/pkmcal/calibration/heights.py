@@ -91,8 +91,12 @@ def probed_heights(
     level = measurements.level
     for s in np.unique(station).tolist():
         own = station == s
+        # the plane through the heights in use, horizontal for a level bed
         is_level = len(level) > s and bool(level[s])
-        before[own] -= _plane(before[own], xy[own], used[own], is_level)
+        columns = np.column_stack([np.ones(len(xy)), 0 * xy if is_level else xy])
+        fitted = own & used & np.isfinite(before)
+        plane = np.linalg.lstsq(columns[fitted], before[fitted], rcond=None)[0]
+        before[own] -= columns[own] @ plane
     # readings move the target along the bed's normal, the station's z axis
     by_readings = np.einsum(
         "ni,nij->nj", T_station_base[:, 2, :3], machine.forward_jacobian(T_after)[:, 3:]
@@ -103,10 +107,3 @@ def probed_heights(
     return ProbedHeights(
         configuration, station, xy[:, 0], xy[:, 1], before, after, sigma, used
     )  # fmt: skip
-
-
-def _plane(values: Array, xy: Array, used: Booleans, is_level: bool) -> Array:
-    """Plane (n,) through finite values (n,) at xy (n, 2), horizontal for a level bed."""
-    columns = np.column_stack([np.ones(len(xy)), 0 * xy if is_level else xy])
-    fitted = used & np.isfinite(values)
-    return columns @ np.linalg.lstsq(columns[fitted], values[fitted], rcond=None)[0]

@@ -29,8 +29,6 @@ from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.hypotheses import OPTIONS, Hypothesis, Ranked, decide
 from pkmcal.session.load import Session
 
-FURTHER_THAN_TURNED = 1.5
-"""Estimate of the change above which neither the camera nor the rotated one is right."""
 USUAL_CENTRE_ERROR = 1.5
 """Prior sigma (px) of a calibrated camera's principal point along the change, if its file states
 none."""
@@ -140,7 +138,8 @@ def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
         return 0.0
     mean = float(weight @ value / weight.sum())
     variance = float(1 / weight.sum()) + file_sigma**2
-    return (2 * mean - 1) / (2 * variance) if mean < FURTHER_THAN_TURNED else 0.0
+    # further beyond 1 than the middle between 0 and 1 is before it: neither camera
+    return (2 * mean - 1) / (2 * variance) if mean - 1 < 1 / 2 else 0.0
 
 
 def turned_round(session: Session, cameras: Mapping[str, Camera]) -> Session:

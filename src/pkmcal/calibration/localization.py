@@ -16,7 +16,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
 from pkmcal.identify.verdict import VERDICT
-from pkmcal.levels import MAJORITY
+from pkmcal.levels import MAJORITY, OUTLIER_SIGMAS
 from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, dense
@@ -36,9 +36,6 @@ from pkmcal.session.load import Session, Station
 from pkmcal.session.poses import check_lengths
 from pkmcal.session.readings import frozen
 from pkmcal.wording import amount, listed
-
-ALLOWED_LEG_MISS = 2.0
-"""Prior sigmas by which legs may miss the platform at the nearest nominal pose."""
 
 
 @dataclass(frozen=True)
@@ -181,17 +178,18 @@ def _closing_misfit(session: Session, joints: Array) -> float:
 
 
 def _allowed_leg_miss(machine: Machine, fk: ForwardResult) -> Array:
-    """Largest closure error (K,), m, at the readings of a machine that differs by its prior sigmas.
+    """Largest closure error (K,), m, at the readings of a machine that differs by its prior sigmas,
+    up to OUTLIER_SIGMAS times.
 
     More rods than degrees of freedom meet only in the true geometry: each has a closure error of
     its own.
     """
     table = machine.parameters
     if not machine.layout.overdetermined:
-        return np.full(len(fk.error), ALLOWED_LEG_MISS * machine.document.tolerance.center)
+        return np.full(len(fk.error), OUTLIER_SIGMAS * machine.document.tolerance.center)
     c = closure(machine.layout, machine.values, fk.readings, fk.T_base_platform, fk.internal)
     by_prior = dense(c, len(table)) @ (table.free_matrix() * table.tolerances_free())
-    return ALLOWED_LEG_MISS * np.linalg.norm(by_prior, axis=-1).max(axis=-1)
+    return OUTLIER_SIGMAS * np.linalg.norm(by_prior, axis=-1).max(axis=-1)
 
 
 def _turn(poses: Array) -> Array:

@@ -7,8 +7,9 @@ false-alarm level of the session (:mod:`pkmcal.identify.score`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby, islice, product
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from pkmcal.calibration.discrepancy_basis import (
     model_errors,
     with_discrepancy,
 )
-from pkmcal.calibration.tube_outlines import Outline, outlines
+from pkmcal.calibration.tube_outlines import outlines
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.discrepancy import discrepancy_of
 from pkmcal.identify.estimate import Estimate
@@ -47,6 +48,8 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
 from pkmcal.session.load import Session
 
+Family = Callable[[Session, Observation, Measurements, Estimate], Iterable[Column]]
+"""Columns of model violations that share a part of the false-alarm level."""
 MOST_TOOL_SHIFT = 1.0
 """Shift of the tool by a violation, in standard deviations, above which the result is refused."""
 
@@ -124,16 +127,23 @@ def model_violations(
     observation: Observation,
     measurements: Measurements,
     estimate: Estimate,
+    tested: Sequence[Family] | None = None,
 ) -> ModelViolations:
     """Deviations of the data from the model, with and without names.
 
-    A violation is named only if it explains more than the discrepancy does: after the discrepancy
-    is estimated, violations are tested again with its components as random effects.
+    A violation is named only if it explains more than the discrepancy does: those that are detected
+    first are tested once more beside the discrepancy. The discrepancy in turn is estimated beside
+    the violations that are named, and beside no others.
+
+    tested : families of violations, :data:`TESTED` by default.
     """
     # columns of all violations, by family; tubes have a score of their own
     ended = estimate.linearized
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
-    families = [list(family(session, observation, measurements, estimate)) for family in TESTED]
+    families = [
+        list(family(session, observation, measurements, estimate))
+        for family in (TESTED if tested is None else tested)
+    ]
     tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
     further = [one for one in columns_of_effects(measurements) if one.prior is None]
     families += [list(group) for _, group in groupby(further, key=lambda one: one.code)]
@@ -154,7 +164,7 @@ def model_violations(
         configuration = session.configurations[in_view[row]]
         return readings.wrong_reading(columns[m], units[m], configuration, by)
 
-    def tested(beside: Sequence[Column]) -> tuple[ScoreTests, list[tuple[int, Score]]]:
+    def scored(beside: Sequence[Column]) -> tuple[ScoreTests, list[tuple[int, Score]]]:
         tests = ScoreTests(
             *ended,
             listed,
@@ -166,17 +176,26 @@ def model_violations(
         value = tests.significant([k for k, _ in tube_scores])
         return tests, [*value, *tube_scores]
 
-    # violations, then the discrepancy beside them, then the violations beside the discrepancy
-    tests, value = tested(())
-    discrepancy = discrepancy_of(
-        *ended,
-        discrepancy_components(measurements, estimate),
-        [declared(k) for k, _ in value],
-        (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
-        only_heights(estimate),
-    )
-    if discrepancy.scales and value:
-        tests, value = tested(discrepancy.random)
+    # violations, the discrepancy beside them, then the violations beside the discrepancy
+    components = discrepancy_components(measurements, estimate)
+    tests, value = scored(())
+    rivals = detected = [k for k, _ in value]
+    while True:
+        discrepancy = discrepancy_of(
+            *ended,
+            components,
+            [declared(k) for k in rivals],
+            (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
+            only_heights(estimate),
+        )
+        if not detected or (rivals is detected and not discrepancy.scales):
+            break
+        # a rival that is no violation beside the discrepancy must have no part in it
+        tests, value = scored(discrepancy.random)
+        named = {k for k, _ in value}
+        if named.issuperset(rivals):
+            break
+        rivals = [k for k in rivals if k in named]
     # covariance with the discrepancy, and its effect on the tool
     before = tool_of(session, estimate)
     estimate = with_discrepancy(estimate, discrepancy)
@@ -189,9 +208,12 @@ def model_violations(
         return ModelViolations((), errors, estimate, discrepancy.random)
     # one-step estimates of the named violations
     fits = tests.fitted([k for k, _ in value])
-    last = len(fits) - len(tubes)
-    fits[last:] = [_tube_update(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
-    numbers = [k for k, _ in value]
+    # the value of a tube is the median of its lines'
+    for k, one in enumerate(tubes, len(fits) - len(tubes)):
+        share = one.value / fits[k].value[0] if fits[k].value[0] else 0.0
+        fits[k] = OneStepUpdate(
+            np.array([one.value]), np.array([one.sigma]), fits[k].by_data * share
+        )
     violations = tuple(
         _detection(
             declared(k),
@@ -201,7 +223,7 @@ def model_violations(
             # a tube's value is that of its own lines
             []
             if k in dict(tube_scores)
-            else [listed[n] for n in tests.rivals(k, [n for n in numbers if n != k])],
+            else [listed[n] for n in tests.rivals(k, [n for n, _ in value if n != k])],
         )
         for (k, score), fit in zip(value, fits, strict=True)
     )
@@ -218,14 +240,6 @@ def tool_of(session: Session, estimate: Estimate) -> ToolAccuracy:
         estimate.state.T_base_platform[used],
         session.joints[used],
         legs_observed=estimate.edge_weights.size > 0,
-    )
-
-
-def _tube_update(fit: OneStepUpdate, one: Outline) -> OneStepUpdate:
-    """Update of a tube's violation with the value from the median of its lines."""
-    value, sigma = np.array([one.value]), np.array([one.sigma])
-    return OneStepUpdate(
-        value, sigma, fit.by_data * (one.value / fit.value[0] if fit.value[0] else 0.0)
     )
 
 
@@ -262,22 +276,17 @@ def _reading_scales(
     yield from readings.scale_columns(measured.joints, document["columns"], present[first])
 
 
-def _reading_plays(
-    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+def _motors(
+    columns: Callable[[Array, Sequence[str], Sequence[str]], Iterator[Column]],
+    session: Session,
+    observation: Observation,
+    measured: Measurements,
+    estimate: Estimate,
 ) -> Iterator[Column]:
-    """Play of the motors."""
+    """Columns of the motors' readings, from their names and units."""
     del observation, estimate
     names, units = session.document["joints"]["columns"], session.machine.joint_units
-    yield from readings.play_columns(measured.joints, names, units)
-
-
-def _eccentric_encoders(
-    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
-) -> Iterator[Column]:
-    """Eccentricity of the encoder discs of cranks."""
-    del observation, estimate
-    names, units = session.document["joints"]["columns"], session.machine.joint_units
-    yield from readings.eccentricity_columns(measured.joints, names, units)
+    return columns(measured.joints, names, units)
 
 
 def _lenses(
@@ -550,8 +559,9 @@ def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
     return {"value": size, "sigma": spread, "angles": value.tolist()}
 
 
-TESTED = (
-    _reading_scales, _reading_plays, _eccentric_encoders, _leaning_towers, _screw_leads,
+TESTED: tuple[Family, ...] = (
+    _reading_scales, partial(_motors, readings.play_columns),
+    partial(_motors, readings.eccentricity_columns), _leaning_towers, _screw_leads,
     _joint_offsets, _sag, _lenses, _lenses_of_stations, _boards, _tripods,
 )  # fmt: skip
 """Families of tested columns: assumptions of a session that may be wrong."""

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
@@ -104,8 +103,6 @@ def outlier_explanations(
         return
     squares = measured.squares(off)
     usual = max(float(np.median(squares)) / m, 1.0)  # contains the model errors of all poses
-    if usual > HOPELESS_POSE_SCALE**2:
-        return  # no pose fits, so there are no outliers
     measured = measured._replace(noise=usual * measured.noise)
     # rejected poses that are outliers at that scale
     least = SESSION_FALSE_ALARM.of_test(Search.OUTLIERS, len(which))

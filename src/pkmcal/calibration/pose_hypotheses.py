@@ -42,7 +42,7 @@ from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import identified, only_heights
 from pkmcal.identify.verdict import VERDICT, RicherModel
-from pkmcal.levels import LARGEST_NOMINAL_ERROR
+from pkmcal.levels import LARGEST_NOMINAL_ERROR, NEARLY_ALL
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
@@ -64,7 +64,7 @@ from pkmcal.outcome.hypotheses import (
 from pkmcal.session.load import Session
 from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
 
-EXPLAINED_POSES_SHARE = 0.85
+EXPLAINED_POSES_SHARE = NEARLY_ALL
 """Share of the poses that a hypothesis has to explain; the rest may be outliers."""
 HOPELESS_POSE_SCALE = 50.0
 """Factor on the poses' noise above which an estimate under a hypothesis is abandoned after a first

@@ -14,7 +14,6 @@ from pkmcal.identify.confirmation import RejectedUnit, rejected_units, rejection
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import platform_by_parameters, platform_sigma
 from pkmcal.identify.unidentified import Identification
-from pkmcal.identify.verdict import VERDICT, usual_scale
 from pkmcal.measurements import LinkSet, Measurements
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome.finding import Finding, doubtful, wrong
@@ -42,8 +41,10 @@ def rejection_findings(
         require.
     """
     units = rejected_units(measurements, estimate)
-    if at_minimum:
-        yield from _links(measurements, estimate)
+    statistics, labels = estimate.statistics, session.labels.get("links")
+    if at_minimum and labels and statistics.dof_links < LEAST_CHECKED_SHARE * statistics.n_links:
+        # they alone determine something, so that an outlier leaves hardly any residual
+        yield doubtful("links.unchecked", listed(labels), names=labels)
     if not units:
         return
     edges = measurements.edges
@@ -89,22 +90,6 @@ def rejection_findings(
             tool_shift=value.shift,
             sigma=sigma,
         )
-
-
-def _links(measurements: Measurements, estimate: Estimate) -> Iterator[Finding]:
-    """Findings on links that the model does not explain, as of poses; and a warning where they
-    alone determine something, so that an outlier leaves hardly any residual.
-    """
-    s = estimate.statistics
-    if not measurements.n_links:
-        return
-    labels = [measurement_kinds()[links.kind].label for links in measurements.links]
-    if s.dof_links < LEAST_CHECKED_SHARE * s.n_links:
-        yield doubtful("links.unchecked", listed(labels), names=labels)
-    if s.link_scale > VERDICT.too_noisy:
-        yield wrong("links.misfit", listed(labels), names=labels, scale=s.link_scale)
-    elif s.link_scale > usual_scale(s.dof_links):
-        yield doubtful("links.scatter", listed(labels), names=labels, scale=s.link_scale)
 
 
 def unused_configurations(

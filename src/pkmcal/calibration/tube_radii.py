@@ -20,7 +20,7 @@ from pkmcal.calibration.chance_matches import chance_match_reason
 from pkmcal.calibration.handheld import localize_case
 from pkmcal.calibration.refinement import RefinementResult, refine_alternating
 from pkmcal.identify.verdict import VERDICT
-from pkmcal.mechanisms import Machine
+from pkmcal.levels import NOISE_EXCESS
 from pkmcal.mechanisms.document import Leg
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.observe.hypotheses import diameters, log_prior_of_each
@@ -56,14 +56,17 @@ def explain_radii(
     prior = log_prior_of_each(case.session.machine, case.session.joints)
     # The evidence costs a localization and a refinement; it is not needed if edges scatter no more
     # than in right sessions.
-    least = max(harmless_misfit(n_effective, prior), VERDICT.edge_scatter)
+    least = max(harmless_misfit(n_effective, prior), NOISE_EXCESS)
     if not case.images or null <= least:
         return Explanation()
     inliers = 0.0 if turns is None else float(turns.estimate.edge_weights.sum())
     untested: list[Finding] = []
 
     def misfit(hypothesis: RadiiHypothesis) -> float:
-        other = _refined(case, hypothesis.apply(case.session), refine_camera, seed)
+        rng = np.random.default_rng(seed)
+        again = localize_case(hypothesis.apply(case.session), case.images, case.boards, rng)
+        cameras = refinement_of(again.session, refine_camera)
+        other = refine_alternating(again, cameras, no_progress, lambda _step: None)
         more = other.estimate.edge_weights.sum() > inliers
         return _edge_misfit(other) if more else np.inf
 
@@ -89,21 +92,11 @@ def _edge_misfit(turns: RefinementResult | None) -> float:
     return max(scale, VERDICT.too_noisy) if chance_match_reason(turns) else scale
 
 
-def _refined(case: Case, session: Session, refine_camera: bool, seed: int) -> RefinementResult:
-    """The refinement of another session with the images of a case."""
-    rng = np.random.default_rng(seed)
-    again = localize_case(session, case.images, case.boards, rng)
-    cameras = refinement_of(again.session, refine_camera)
-    return refine_alternating(again, cameras, no_progress, lambda _step: None)
-
-
 def _of_half_the_radii(session: Session) -> Session:
-    return replace(session, machine=_thinner(session.machine))
-
-
-def _thinner(machine: Machine) -> Machine:
+    document = session.machine.document
     legs: list[Leg] = []
-    for leg in machine.document.legs:
+    for leg in document.legs:
         tubes = [tube.model_copy(update={"radius": tube.radius / 2}) for tube in leg.tubes]
         legs.append(leg.model_copy(update={"tubes": tuple(tubes)}))
-    return machine_from_document(machine.document.model_copy(update={"legs": tuple(legs)}))
+    thinner = machine_from_document(document.model_copy(update={"legs": tuple(legs)}))
+    return replace(session, machine=thinner)

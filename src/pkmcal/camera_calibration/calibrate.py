@@ -48,7 +48,14 @@ from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, json_value
 from pkmcal.geometry.rigid import apply, dot
-from pkmcal.levels import MAJORITY, NEGLIGIBLE
+from pkmcal.levels import (
+    FALSE_ALARM,
+    MAJORITY,
+    NEARLY_ALL,
+    NEGLIGIBLE,
+    OUTLIER_SIGMAS,
+    UNEXPLAINED_SCALE,
+)
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.solver.kernels import INLIER_WEIGHT
@@ -65,7 +72,7 @@ class CalibrationCheckOptions:
     good_views: int = 6
     # ratio of held-out errors above which a model named by the user is refused; a smaller
     # significant ratio gives a warning
-    unfit_ratio: float = 3.0
+    unfit_ratio: float = UNEXPLAINED_SCALE
     # largest standard deviation of the focal length, as a share of it; a machine of 1 m would be
     # off by 2 cm
     least_sure: float = 0.02
@@ -73,14 +80,12 @@ class CalibrationCheckOptions:
     # corners, which does not represent the rest if its errors are of another kind
     most_lost: float = 0.25
     # ratio of a view's held-out error to the median of all views above which the view is reported
-    outlying_view: float = 2.5
+    outlying_view: float = OUTLIER_SIGMAS
     # tilt of a board in degrees below which views all have the same information on the focal
     # length, which is little
     facing_tilt: float = 15.0
     # most steps in which a board's bend and the rest are estimated in turn; two or three suffice
     bend_steps: int = 10
-    # probability by chance below which a deviation of the board from its file is reported
-    deviation_alpha: float = 1e-3
     # columns and rows of cells by which the coverage of the image is counted
     cells: tuple[int, int] = (8, 6)
     # share of cells with corners below which a warning is given
@@ -93,7 +98,7 @@ class CalibrationCheckOptions:
 CALIBRATION_CHECK_OPTIONS = CalibrationCheckOptions()
 UNCERTAINTY_CELLS = (32, 24)
 """Columns and rows of cells in which the projection's uncertainty is computed."""
-STRONG_CORRELATION = 0.95
+STRONG_CORRELATION = NEARLY_ALL**0.5
 """Correlation from which two intrinsics are reported as hardly separable."""
 
 
@@ -301,6 +306,7 @@ def calibrate_camera(
         for column in board_columns(board)
         if not (bend and column.code == "bend")
     )
+    middles = apply(fit.T_camera_board, views.points.mean(axis=0))
     calibration = CameraCalibration(
         camera=replace(fit.camera, covariance=covariance),
         terms=chosen.terms,
@@ -323,7 +329,7 @@ def calibrate_camera(
         detections=tuple(detections),
         bend=bent,
         deviations=deviations,
-        distance=distance or _median_distance(fit.T_camera_board, views.points),
+        distance=distance or float(np.median(np.linalg.norm(middles, axis=-1))),
         findings=(),
     )
     return replace(
@@ -376,12 +382,6 @@ def _bent_board(
     return fit, views, step._replace(value=value)
 
 
-def _median_distance(T_camera_board: Array, points: Array) -> float:
-    """Median distance of boards' middles from the camera, m."""
-    middles = apply(T_camera_board, points.mean(axis=0))
-    return float(np.median(np.linalg.norm(middles, axis=-1)))
-
-
 def _check_model_name(model: str) -> None:
     """Raise InputError for an unknown camera model."""
     models = ("auto", *CALIBRATED_MODELS)
@@ -393,12 +393,10 @@ def _check_model_name(model: str) -> None:
         )
 
 
-def _deviation_findings(
-    c: CameraCalibration, options: CalibrationCheckOptions
-) -> Iterator[Finding]:
+def _deviation_findings(c: CameraCalibration) -> Iterator[Finding]:
     """Warnings about a board that deviates from its file."""
     for one in c.deviations:
-        if one.chance < options.deviation_alpha:
+        if one.chance < FALSE_ALARM / len(c.deviations):
             largest = int(np.argmax(np.abs(one.value)))
             yield doubtful(
                 f"lens.board_{one.code}",
@@ -576,7 +574,7 @@ def calibration_findings(
         yield doubtful("lens.some_mirrored", listed(mirrored), names=mirrored)
     elif mirrored:
         yield doubtful("lens.all_mirrored", number=len(mirrored), first=mirrored[0])
-    yield from _deviation_findings(c, options)
+    yield from _deviation_findings(c)
     if c.spread > 1:
         yield doubtful("lens.views_disagree", scale=c.spread)
     most = float(tilts(c.T_camera_board, c.board.points).max())

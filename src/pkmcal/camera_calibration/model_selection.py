@@ -62,13 +62,6 @@ class ModelSelectionOptions:
     least_rays: int = 4
     # fewest corners kept of each view, if it has as many
     least_of_view: int = 12
-    # ratio of residuals to another model's, with so many radial terms, above which no more terms
-    # are tried
-    hopeless_ratio: float = 5.0
-    hopeless_terms: int = 2
-    # median residual, px, up to which a model is not hopeless: tangential terms alone may be
-    # missing, of which sharp images show hundredths of a pixel
-    hopeless_residual: float = 0.5
 
 
 MODEL_SELECTION_OPTIONS = ModelSelectionOptions()
@@ -287,19 +280,13 @@ def camera_candidates(
     are missing.
     """
     fits: list[tuple[str, tuple[str, ...], CameraFit]] = []
-    # Models for wide lenses first: they fit almost any lens, and show which others are hopeless.
-    for model in sorted(models, key=CALIBRATED_MODELS.index, reverse=True):
+    for model in sorted(models, key=CALIBRATED_MODELS.index):
         start = first_fit(model, views, image_size, options=options)
         if start is None:
             continue
         for terms in camera_models()[model].search.terms:
             fit = extended(start, views, terms)
             fits.append((model, terms, fit))
-            radial = sum(name.startswith("k") for name in terms)
-            best_residual = min(_median_residual(f) for _, _, f in fits)
-            hopeless = max(options.hopeless_ratio * best_residual, options.hopeless_residual)
-            if radial >= options.hopeless_terms and _median_residual(fit) > hopeless:
-                break
             # a larger set starts from this fit
             start = fit if "k1" in terms else start
     if not fits:

@@ -45,7 +45,7 @@ from pkmcal.checks.sentences import (
 )
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
+from pkmcal.identify.verdict import misfit
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
@@ -283,7 +283,7 @@ def _check_images(
     if isinstance(settled, Settled):
         findings += settled.findings
         heights = settled.case.session.heights_alone
-        findings += _height_findings(settled) if heights else _pose_scale_findings(settled)
+        findings += _height_findings(settled) if heights else _misfit_findings(settled)
     # A rejected station on a tripod was recognized, and its quality may explain the rejection.
     rejected_names = {one.station.name for one in rejected if one.station.handheld}
     if isinstance(case, PkmcalError):  # no hand-held image was localized then
@@ -526,14 +526,14 @@ def _height_findings(settled: Settled) -> list[Finding]:
     return [
         *(replace(one.finding, level=Level.DOUBTFUL) for one in tested.violations),
         *discrepancy_findings(tested.errors),
-        *([] if explains_heights(tested.errors) else _pose_scale_findings(settled)),
+        *([] if explains_heights(tested.errors) else _misfit_findings(settled)),
     ]
 
 
-def _pose_scale_findings(settled: Settled) -> list[Finding]:
-    """Finding if measured poses scatter more than their noise."""
-    scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
-    if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:
-        return []
-    model = {"model": richer and richer.name, "model_scale": richer and richer.scale}
-    return [doubtful("poses.explained", scale=scale, **model)]
+def _misfit_findings(settled: Settled) -> list[Finding]:
+    """Findings on measurements without images that the model does not explain; edges are measured
+    roughly here.
+    """
+    session, fit = settled.case.session, settled.turns.estimate
+    every = misfit(fit, session.labels, settled.richer, ["edges"])
+    return [replace(one, level=Level.DOUBTFUL) for one in every]

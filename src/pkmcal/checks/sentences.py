@@ -17,8 +17,9 @@ from pkmcal.checks.results import BoardCheck, JointCheck, SessionCheck, StationC
 from pkmcal.files import resolved
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.judge.repeatability import RepeatStudy, part_of
-from pkmcal.levels import MAJORITY
+from pkmcal.levels import MAJORITY, RELEVANT_FACTOR
 from pkmcal.measurements.contract import measurement_kinds
+from pkmcal.observe.profiles import PROFILE_OPTIONS
 from pkmcal.outcome import Figure, Mark, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note
 from pkmcal.session.load import Session
@@ -27,8 +28,9 @@ from pkmcal.wording import DISPLAY_UNITS, Chance, count, listed, number, with_un
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
 """Share of saturated pixels on the legs above which edges are lost; a highlight covers a tenth."""
-BLUR_STILL_MEASURED = 1.7
-"""Blur (px) beyond which edges are measured badly: the model of an edge ends at 1.5."""
+BLUR_STILL_MEASURED = RELEVANT_FACTOR * PROFILE_OPTIONS.blur_range[1]
+"""Blur (px) beyond which edges are measured badly: the widest that the model of an edge tries, by
+the factor that matters."""
 POOR_CORNERS = 0.5
 """Residual of corners (px rms) beyond that of any sharp image of a flat board."""
 STATION_COLUMNS = {

@@ -126,7 +126,12 @@ def _nominal(model: ReadModel, form: str, path: Path, tube: float | None) -> Nom
     parts, tool = _without_tools(parts)
     platform = _platform(parts)
     parts = _with_readings(parts, platform)
-    motors = _motors(parts, platform)
+    # cranks and carriages: bodies on the base by one joint that a motor moves
+    motors = {
+        e.second: e.steps[0]
+        for e in parts.of(0)
+        if len(e.steps) == 1 and e.steps[0].dof in parts.model.actuated and e.second != platform
+    }
     bars = _bars(parts, platform)
     chains = _chains(parts, {0, *motors}, {platform, *bars})
     guides = [c for c in chains if sum(s.kind == "slide" for s in c.steps) > 1]
@@ -263,15 +268,6 @@ def _with_readings(parts: RigidBodies, platform: int) -> RigidBodies:
         dofs = [steps[0].dof for steps in firsts if len(steps) == 1 and steps[0].dof >= 0]
     model = replace(model, actuated=np.array(dofs, dtype=int), gear=np.ones(len(dofs)))
     return replace(parts, model=model)
-
-
-def _motors(parts: RigidBodies, platform: int) -> dict[int, Step]:
-    """Cranks and carriages: bodies on the base by one joint that a motor moves."""
-    return {
-        e.second: e.steps[0]
-        for e in parts.of(0)
-        if len(e.steps) == 1 and e.steps[0].dof in parts.model.actuated and e.second != platform
-    }
 
 
 def _bars(parts: RigidBodies, platform: int) -> dict[int, Step]:

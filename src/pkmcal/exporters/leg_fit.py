@@ -11,13 +11,12 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.exporters.rigid_bodies import RigidBodies, Step
 from pkmcal.geometry.rigid import cross, inverse, rotation
+from pkmcal.levels import ROUNDING
 from pkmcal.starter.nominal import NominalLeg, millimetres
 
 GEOMETRY_SHARE = 1e-4
 """Tolerance for axes that meet in a point, as a share of the machine's size, and of a direction:
 numbers of other files have few digits."""
-SAME_POINT = 1e-12
-"""Distance (m) of joints in one point: rounding."""
 
 
 class Chain(NamedTuple):
@@ -33,7 +32,7 @@ def _meeting_point(steps: Sequence[Step]) -> tuple[Array, float]:
     an axis, m.
     """
     first = next((s for s in steps if s.kind == "ball"), steps[0])
-    if np.ptp([s.point for s in steps], axis=0).max() < SAME_POINT:
+    if np.ptp([s.point for s in steps], axis=0).max() < ROUNDING:
         return first.point, 0.0
     across = [np.eye(3) - np.outer(s.axis, s.axis) for s in steps]
     point = first.point

@@ -26,13 +26,12 @@ from pkmcal.exporters.read_model import (
 )
 from pkmcal.exporters.xml_read import TUBE_MARK, attribute, refused, unit_axis, vector, xml_root
 from pkmcal.geometry.rigid import from_quaternion, inverse, pose, pose_difference, rotation
+from pkmcal.levels import ROUNDING
 
 UNREAD_ELEMENTS = ("include", "replicate", "composite", "flexcomp", "frame", "attach")
 """Elements that add bodies, or move those inside them."""
 UNREAD_ORIENTATIONS = ("xyaxes", "zaxis")
 FREEDOMS = {"free": 6, "ball": 3, "hinge": 1, "slide": 1}
-SAME_POINT = 1e-12
-"""Distance (m) within which two joints of a body have one position."""
 
 
 def read_mujoco(text: str) -> ReadModel:
@@ -169,7 +168,7 @@ class _Bodies:
         for j in node:
             if j.tag in ("joint", "freejoint"):
                 point = vector(j, "pos", "0 0 0")
-                if np.abs(point - groups[-1][0]).max() > SAME_POINT:
+                if np.abs(point - groups[-1][0]).max() > ROUNDING:
                     groups.append((point, []))
                 groups[-1][1].extend(self._joints(j))
         # a hinge beside the body's origin: a body there, and the body fixed to it

@@ -65,7 +65,10 @@ def read_sdf(text: str) -> ReadModel:
         if (node := model.find(name)) is not None:
             raise refused(node, f"<{name}> inside a model is not read", expected="its links")
     # links as bodies along the tree, then loops between them
-    tree = _Links(model, _version(root))
+    words = root.get("version", "").split(".")
+    if root.tag != "sdf" or not all(word.isdecimal() and len(word) < 4 for word in words):
+        raise InputError("this is no SDF", where=label_of(root), expected='<sdf version="1.7">')
+    tree = _Links(model, tuple(map(int, words)))
     for link in tree.links:
         tree.put(link)
     loops = [tree.loop(name) for name in tree.joints if name in tree.closing]
@@ -265,14 +268,6 @@ class _Links:
         if out:
             self.joints_by_name[name] = out[0]
         return tuple(out)
-
-
-def _version(root: Element) -> tuple[int, ...]:
-    """Version of the format."""
-    words = root.get("version", "").split(".")
-    if root.tag != "sdf" or not all(word.isdecimal() and len(word) < 4 for word in words):
-        raise InputError("this is no SDF", where=label_of(root), expected='<sdf version="1.7">')
-    return tuple(map(int, words))
 
 
 def _named(model: Element, tag: str) -> dict[str, Element]:

@@ -458,6 +458,33 @@ def touches_at(
     return Touches(carriages, np.full(len(points), height), label, sigma)
 
 
+def printer_number(
+    text: str,
+    name: str,
+    where: str,
+    *,
+    line: str = "",
+    expected: str = "a number in mm, or degrees",
+) -> float:
+    """Number in a firmware's configuration.
+
+    name : of the value in messages. line : text for messages, where the number's own is not enough.
+    Raises InputError for what is no number within LARGEST_PRINTER_VALUE.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not abs(value) <= LARGEST_PRINTER_VALUE:
+        raise InputError(
+            f"{name} is no number that a printer can have",
+            where=where,
+            found=quoted(line or text),
+            expected=expected,
+        )
+    return value
+
+
 def reachable_carriages(points: Array, printer: Printer, label: str) -> Array:
     """Carriages (n, 3) mm with the tool at points (n, 3) mm.
 

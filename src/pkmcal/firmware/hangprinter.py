@@ -104,7 +104,10 @@ class Hangprinter(Exporter):
         origin = np.eye(4)
         origin[:3, :3] = poses[0, :3, :3]
         readings = machine.inverse(poses) - machine.inverse(origin[None])
-        line = _line_positions(words, poses[:, :3, 3])
+        # positions (n, L), m, of the lines
+        anchors = 1e-3 * words["anchors"]
+        apart = poses[:, None, :3, 3] - anchors
+        line = np.sqrt(dot(apart, apart)) - np.linalg.norm(anchors, axis=1)
         if "R" not in words:
             true = readings * scales(machine.layout, machine.values)[order]
             return [Difference("lines' positions", largest(line, true), LINE_ROUNDING)]
@@ -324,12 +327,6 @@ def _model(text: str, label: str) -> NominalModel:
 
 
 # The firmware's formulas
-
-
-def _line_positions(words: dict[str, Array], points: Array) -> Array:
-    """Positions (n, L), m, of the lines at points (n, 3), m."""
-    line = points[:, None] - 1e-3 * words["anchors"]
-    return np.sqrt(dot(line, line)) - np.linalg.norm(1e-3 * words["anchors"], axis=1)
 
 
 def _motor_turns(words: dict[str, Array], positions: Array) -> Array:

@@ -30,7 +30,12 @@ import numpy as np
 from pkmcal.arrays import short_repr
 from pkmcal.errors import InputError, legible
 from pkmcal.files import LARGEST_WRITTEN_FILE, quoted, read_text
-from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, missing_value, misspelt_remarks
+from pkmcal.firmware.contract import (
+    LARGEST_PRINTER_VALUE,
+    missing_value,
+    misspelt_remarks,
+    printer_number,
+)
 
 KEYS = (
     "kinematics", "delta_radius", "print_radius", "shoulder_radius", "shoulder_height",
@@ -95,18 +100,7 @@ class KlipperConfig:
                 f" {self.label}, if that has it",
             )
         text, where = self.entries[section][name]
-        try:
-            value = float(text)
-        except ValueError:
-            value = np.nan
-        if not abs(value) <= LARGEST_PRINTER_VALUE:
-            raise InputError(
-                f"{name} is no number that a printer can have",
-                where=where,
-                found=quoted(text),
-                expected="a number in mm, or degrees",
-            )
-        return value
+        return printer_number(text, name, where)
 
     def _places(self, section: str) -> dict[str, str]:
         """Places of a section's entries by name."""

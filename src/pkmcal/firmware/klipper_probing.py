@@ -141,20 +141,17 @@ def probed_touches(text: str, label: str, printer: Printer) -> Touches | None:
         elif match := _CONTACT.search(line):
             contact.append((float(match[1]), float(match[2]), float(match[3])))
         elif _RETRY in line:
-            _drop_last_place(triggered or contact)
+            # all samples at the place of the last one are taken again
+            points = triggered or contact
+            place = points[-1][:2] if points else None
+            while points and points[-1][:2] == place:
+                points.pop()
     if not triggered and not contact:
         return None
     dx, dy, dz = printer.offset
     offset, height = (np.zeros(3), dz) if triggered else (np.array([dx, dy, 0.0]), 0.0)
     tool = means_by_position(np.array(triggered or contact)) - offset
     return touches_at(tool, height, printer, label, root_mean_square(_ACCURACY.findall(text)))
-
-
-def _drop_last_place(points: list[tuple[float, float, float]]) -> None:
-    """Remove all samples at the place of the last one."""
-    place = points[-1][:2] if points else None
-    while points and points[-1][:2] == place:
-        points.pop()
 
 
 def mesh_touches(config: KlipperConfig, printer: Printer) -> Touches | None:

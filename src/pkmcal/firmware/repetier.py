@@ -24,13 +24,12 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length
-from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
-    LARGEST_PRINTER_VALUE,
     TOWER_ANGLES,
     Firmware,
     Printer,
     WrittenValues,
+    printer_number,
 )
 from pkmcal.firmware.towers import (
     SettingNames,
@@ -173,18 +172,10 @@ def _eeprom(text: str, label: str) -> Words:
         match = _EEPROM.search(line) or _WRITTEN.match(line.strip())
         if not match:
             continue
-        try:
-            value = float(match[3])
-        except ValueError:
-            value = np.nan
-        if not abs(value) <= LARGEST_PRINTER_VALUE:
-            raise InputError(
-                "a value of this line is no number that a printer can have",
-                where=f"{label}, line {n}",
-                found=quoted(match[0]),
-                expected="a number in mm, degrees or steps",
-            )
-        out[match[2]] = value, f"{label}, line {n}"
+        where, what = f"{label}, line {n}", "a value of this line"
+        expected = "a number in mm, degrees or steps"
+        value = printer_number(match[3], what, where, line=match[0], expected=expected)
+        out[match[2]] = value, where
     return out
 
 

@@ -295,7 +295,9 @@ def heights_texts(
     names, carriages, distances = heights, touches.carriages, dict[str, str]()
     if part is not None:
         names, carriages = [*heights, *part.names], np.concatenate([carriages, part.carriages])
-        distances["distances.csv"] = _distances_text(part)
+        rows = zip(part.between.tolist(), part.distance.round(6).tolist(), strict=True)
+        lines = [f"{part.names[a]},{part.names[b]},{value!r}" for (a, b), value in rows]
+        distances["distances.csv"] = "\n".join(["from,to,distance [mm]", *lines]) + "\n"
     session = PROBED_SESSION_TEXT.format(
         n=len(heights),
         origin=legible(touches.origin),
@@ -323,13 +325,6 @@ def _part_text(part: PrintedPart) -> str:
     if part.noise is None:
         return text + DEFAULT_CALIPER_TEXT.format(sigma=_default_sigma(Distances))
     return text + f"  noise: {part.noise:g} mm\n"
-
-
-def _distances_text(part: PrintedPart) -> str:
-    """Table of the distances."""
-    rows = zip(part.between.tolist(), part.distance.round(6).tolist(), strict=True)
-    lines = [f"{part.names[a]},{part.names[b]},{value!r}" for (a, b), value in rows]
-    return "\n".join(["from,to,distance [mm]", *lines]) + "\n"
 
 
 def _default_sigma(kind: type[MeasurementKind]) -> str:

@@ -29,9 +29,7 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length, steps_correction
-from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
-    LARGEST_PRINTER_VALUE,
     TOWER_ANGLES,
     Firmware,
     Printer,
@@ -40,6 +38,7 @@ from pkmcal.firmware.contract import (
     means_by_position,
     missing_value,
     misspelt_remarks,
+    printer_number,
     touches_at,
 )
 from pkmcal.firmware.towers import (
@@ -244,16 +243,6 @@ def _config_words(text: str, label: str) -> Words:
     for n, key, value in _config(text):
         if key not in CONFIG_WORDS:
             continue
-        try:
-            number = float(value)
-        except ValueError:
-            number = np.nan
-        if not abs(number) <= LARGEST_PRINTER_VALUE:
-            raise InputError(
-                f"{key} is no number that a printer can have",
-                where=f"{label}, line {n}",
-                found=quoted(value),
-                expected="a number in mm, or degrees",
-            )
-        out[CONFIG_WORDS[key]] = number, f"{label}, line {n}"
+        where = f"{label}, line {n}"
+        out[CONFIG_WORDS[key]] = printer_number(value, key, where), where
     return out

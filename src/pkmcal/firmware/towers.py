@@ -28,14 +28,13 @@ from pkmcal.exporters.delta import (
     firmware_length,
     proportional_switches,
 )
-from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     CARRIAGE_STEP,
-    LARGEST_PRINTER_VALUE,
     TOWER_ANGLES,
     Firmware,
     Printer,
     WrittenValues,
+    printer_number,
 )
 
 HEIGHT_AT_HOME = "Height of the nozzle at home: "
@@ -140,17 +139,13 @@ def read_commands(text: str, label: str, codes: tuple[str, ...]) -> Words:
         for word in command.rest.split():
             if word.lower() == "sensorless":  # values of another kind follow
                 break
-            try:
-                value = float(word[1:])
-            except ValueError:
-                value = math.nan
-            if not abs(value) <= LARGEST_PRINTER_VALUE:
-                raise InputError(
-                    "a value of this line is no number that a printer can have",
-                    where=place,
-                    found=quoted(f"{command.code} {command.rest}"),
-                    expected="a letter and a number in mm, or degrees, in each word",
-                )
+            value = printer_number(
+                word[1:],
+                "a value of this line",
+                place,
+                line=f"{command.code} {command.rest}",
+                expected="a letter and a number in mm, or degrees, in each word",
+            )
             out[command.code[1:] + word[0].upper()] = value, place
     return out
 

@@ -213,9 +213,14 @@ def discrepancy_of(
     kind = (READING_ROWS, POSE_ROWS)[int(np.argmax(enlarged))]
     inflated = kind if max(enlarged) > options.enlarged else None
     noises = [at_solution]
-    for shares in _noise_shares(enlarged, heights, options):
-        other = _with_noise(assembled, shares)
-        noises.append(_products(other, Information(other.problem, info.state), columns))
+    for of_readings, of_poses in _noise_shares(enlarged, heights, options):
+        # the problem with the noise of readings, and of poses, multiplied by a factor each
+        problem = assembled.problem
+        poses = replace(problem.pose_data, weight=problem.pose_data.weight / of_poses**2)
+        noise = problem.joint_noise * of_readings
+        problem = replace(problem, joint_noise=noise, pose_data=poses)
+        other = replace(assembled, problem=problem)
+        noises.append(_products(other, Information(problem, info.state), columns))
     # selection from all components, smooth ones, violations, none; each at its most likely noise
     smooth_end = len(components)
     best, smooth, named_only, noise_alone = (
@@ -377,14 +382,6 @@ def _noise_shares(
         return []
     readings, poses = (np.geomspace(end, 1, count)[:-1].tolist() for end in low)
     return list(zip(readings, poses, strict=True))
-
-
-def _with_noise(assembled: Assembled, factors: tuple[float, float]) -> Assembled:
-    """Problem with the noise of readings, and of poses, multiplied by one factor each."""
-    problem = assembled.problem
-    poses = replace(problem.pose_data, weight=problem.pose_data.weight / factors[1] ** 2)
-    problem = replace(problem, joint_noise=problem.joint_noise * factors[0], pose_data=poses)
-    return replace(assembled, problem=problem)
 
 
 def _products(assembled: Assembled, info: Information, listed: Sequence[Column]) -> _Products:

@@ -20,6 +20,22 @@ from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import Machine
 
 
+class GroupStatistics(NamedTuple):
+    """Statistics of a group of rows, which have one noise scale.
+
+    name : edges, poses, readings or links. scale : factor on the stated noise. chi2 : with that
+    noise. n : numbers. dof : degrees of freedom that the residuals have left. noise_range : factors
+    on the stated noise that the data allow, smallest and largest; None for edges.
+    """
+
+    name: str
+    scale: float
+    chi2: float
+    n: float
+    dof: float
+    noise_range: tuple[float, float | None] | None
+
+
 @dataclass(frozen=True)
 class Statistics:
     """Goodness of fit and noise of an estimate.
@@ -80,10 +96,22 @@ class Statistics:
         At the estimated noise it is about 1 for any model, however wrong, because the factors on
         the noise are estimated from it.
         """
-        chi2 = self.chi2_edges * self.noise_scale**2 + self.chi2_poses * self.pose_scale**2
-        chi2 += self.chi2_joints * self.reading_scale**2 + self.chi2_drawing
-        chi2 += self.chi2_links * self.link_scale**2
+        chi2 = self.chi2_drawing + sum(one.chi2 * one.scale**2 for one in self.groups)
         return chi2 / self.dof if self.dof > 0 else float("nan")
+
+    @property
+    def groups(self) -> tuple[GroupStatistics, ...]:
+        """Statistics of each group of rows."""
+        rows = (
+            ("edges", self.noise_scale, self.chi2_edges, self.n_edges, self.dof_edges, None),
+            ("poses", self.pose_scale, self.chi2_poses, self.n_poses, self.dof_poses,
+             self.pose_range),
+            ("readings", self.reading_scale, self.chi2_joints, self.n_joints, self.dof_joints,
+             self.reading_range),
+            ("links", self.link_scale, self.chi2_links, self.n_links, self.dof_links,
+             self.link_range),
+        )  # fmt: skip
+        return tuple(GroupStatistics(*one) for one in rows)
 
 
 class Linearization(NamedTuple):
@@ -192,6 +220,15 @@ class Estimate:
         column.
         """
         return np.sqrt(np.diag(self.column_covariance.get(code, np.zeros((0, 0)))))
+
+    @property
+    def weights(self) -> dict[str, Array]:
+        """Robust weights 0..1 of the measurements, by group of rows; readings have none."""
+        return {
+            "edges": self.edge_weights,
+            "poses": self.pose_weights,
+            "links": self.link_weights,
+        }
 
     @property
     def covariance(self) -> Array:

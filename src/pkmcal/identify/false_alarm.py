@@ -16,6 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.levels import FALSE_ALARM, NOISE_EXCESS
 
 
 class Search(StrEnum):
@@ -25,7 +26,7 @@ class Search(StrEnum):
     OUTLINES = "tubes of another outline"
     DISCREPANCY = "components of the model discrepancy"
     OUTLIERS = "measured poses that disagree with all others"
-    POSE_NOISE = "poses, and what links them, that scatter more than stated"
+    NOISE = "measurements that scatter more than stated"
     INTRINSICS = "the cameras' intrinsics of the files, compared with refined ones"
 
 
@@ -37,8 +38,8 @@ class FalseAlarm:
     """Level of a session, and the searches that share it."""
 
     # probability of any significant test (violation, discrepancy, outlier) in a session that agrees
-    # with its model: one session of two hundred
-    level: float = 0.005
+    # with its model
+    level: float = FALSE_ALARM
     # share of the level that each search has
     shares: Mapping[Search, float] = field(default_factory=lambda: EQUAL_SHARES)
 
@@ -54,6 +55,12 @@ class FalseAlarm:
 
         dof = max(dof, 1.0)
         return float(np.sqrt(chdtri(dof, self.of_test(search, 1)) / dof))
+
+    def usual_scale(self, dof: float) -> float:
+        """Largest ratio of errors to their stated noise, root mean square, that is no reason for a
+        report.
+        """
+        return max(NOISE_EXCESS, self.scale(Search.NOISE, dof))
 
     def adjusted(
         self, search: Search, chance: Array | float, tests: Array | Integers | int

@@ -196,7 +196,10 @@ def _turns(body: Array, observed: Array) -> list[tuple[Array, Array]]:
     sign = np.where(sign == 0, 1.0, sign)
     # q_camera . (q_measured conj(q_mount) conj(q_body)) is linear in q_mount
     conjugate = np.diag([1.0, -1.0, -1.0, -1.0])
-    each = _left_product(q_measured) @ _right(q_body @ conjugate) @ conjugate
+    # right : matrices of p -> p q of the conjugate
+    right = _left_product(q_body @ conjugate)
+    right[..., 1:, 1:] -= 2 * skew((q_body @ conjugate)[..., 1:])
+    each = _left_product(q_measured) @ right @ conjugate
     u, _, vt = np.linalg.svd(np.sum(sign[..., None, None] * each, axis=1))
     laid = quaternion(register(body[..., :3, 3], observed[..., :3, 3])[..., :3, :3])
     along = u.mT @ laid[..., None]
@@ -213,13 +216,6 @@ def _left_product(q: Array) -> Array:
     out = q[..., :1, None] * np.eye(4)
     out[..., 0, 1:], out[..., 1:, 0] = -q[..., 1:], q[..., 1:]
     out[..., 1:, 1:] += skew(q[..., 1:])
-    return out
-
-
-def _right(q: Array) -> Array:
-    """Matrix (..., 4, 4) of ``p -> p q``."""
-    out = _left_product(q)
-    out[..., 1:, 1:] -= 2 * skew(q[..., 1:])
     return out
 
 

@@ -66,9 +66,9 @@ class UnidentifiedOptions:
     sparse_steps: int = 20
     frame_weight: float = 10.0
 
-    # sine of the angle to the previous motions below which a motion describes nothing new. The
-    # undescribed rest is reported in one sentence, so larger angles must count
-    new_sine: float = 0.1
+    # sine of the angle to the previous motions below which a motion describes nothing new: the new
+    # share of its square is negligible
+    new_sine: float = NEGLIGIBLE**0.5
 
 
 UNIDENTIFIED = UnidentifiedOptions()

@@ -22,6 +22,7 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
     skew,
 )
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.measured_platform import taken
 from pkmcal.measurements import PoseSet
 from pkmcal.measurements.poses import turn_jacobian
@@ -33,11 +34,6 @@ TURNING_BY_FREEDOMS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}
 LEAST_PAIR_TURN = np.radians(10.0)
 """Rotations (rad) between two poses below which their axis is ignored: its noise grows as 1 /
 rotation."""
-DROPPED_HYPOTHESIS_CHANCE = 1e-3
-"""p-value below which a hypothesis is rejected: one valid session in a thousand."""
-ACCEPTED_CHI2_A_FREEDOM = 2.0
-"""chi2 per degree of freedom up to which a hypothesis is accepted all the same: the noise of a pose
-from an image is itself accurate to some 40 % only (lens, print, shading)."""
 ROTATION_AXIS_STEPS = 10
 MOST_TURN_PAIRS = 200_000
 
@@ -66,10 +62,7 @@ class RotationAxis:
     @property
     def tenable(self) -> bool:
         """Whether noise, or noise a little larger than stated, explains the deviations."""
-        return (
-            self.p_value >= DROPPED_HYPOTHESIS_CHANCE
-            or self.chi2 <= ACCEPTED_CHI2_A_FREEDOM * self.dof
-        )
+        return self.chi2 <= SESSION_FALSE_ALARM.usual_scale(self.dof) ** 2 * self.dof
 
     @property
     def sentence(self) -> str:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import negligible_shift
 from pkmcal.identify.tool import centres_and_tool, platform_sigma
@@ -22,8 +23,9 @@ from pkmcal.levels import (
     CONTRADICTION_SIGMAS,
     FEW,
     MAJORITY,
-    NOISE_EXCESS,
+    NEGLIGIBLE,
     ROUNDING,
+    UNEXPLAINED_SCALE,
 )
 from pkmcal.measurements import OWN_SHADING, Observation
 from pkmcal.mechanisms import Machine
@@ -32,7 +34,7 @@ from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note, wrong
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.search import Stop
-from pkmcal.wording import amount, in_full
+from pkmcal.wording import amount, in_full, listed
 
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
@@ -41,16 +43,14 @@ POLISHED_SHADING = 4 * OWN_SHADING
 """Shading of each edge in addition to its line, px, above which tubes look like polished metal, or
 are in hard light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted
 ones."""
-POOR_MODEL_POSE_SCALE = 1.3
-"""Noise scale of poses above which the model is insufficient, if the scale is significant."""
 
 
 @dataclass(frozen=True)
 class VerdictOptions:
     """Limits of a result that may be used."""
 
-    # noise scale of edges or poses above which the model does not explain them
-    too_noisy: float = 4.0
+    # noise scale above which the model does not explain the measurements
+    too_noisy: float = UNEXPLAINED_SCALE
     # share of rejected edges beyond which the remaining ones may be the outliers
     too_many_rejected: float = 0.4
     # limit of the undetermined part of the platform's error by the nominal model. A calibration
@@ -71,14 +71,12 @@ class VerdictOptions:
     # the result is almost surely better than the nominal model; above, new values are not worth
     # their risk
     nominal_error_share: float = 0.5
-    # residual of a reading, in standard deviations, above which it contradicts the images (two in a
-    # billion normal errors are so large), and the share of such readings that is a reason
-    reading_residual: float = 6.0
-    contradicted_share: float = 0.02
+    # residual of a reading, in standard deviations, above which it contradicts the images, and the
+    # share of such readings that is a reason
+    reading_residual: float = CONTRADICTION_SIGMAS
+    contradicted_share: float = NEGLIGIBLE
     # number of a leg's edges, relative to the median of all legs, below which it is seldom in view
     few_edges_share: float = FEW
-    # factor on the edges' stated noise that causes a warning; the standard deviations contain it
-    edge_scatter: float = NOISE_EXCESS
     # number of configurations below which a note is added
     few_configurations: int = 10
     # number of heights of a bed with which a wrong height is detected before it moves the tool by
@@ -106,6 +104,7 @@ def assess(
     identification: Identification,
     method: str = "bundle",
     *,
+    labels: Mapping[str, Sequence[str]] = MappingProxyType({}),
     richer: RicherModel | None = None,
     explained: bool = False,
     others: Sequence[Finding] = (),
@@ -115,7 +114,7 @@ def assess(
     """Verdict on an estimate of a session.
 
     identification : directions of the machine that the data determine, and those that they do not.
-    richer : model of the machine that explains the poses, where the estimated one is insufficient.
+    labels, richer : as of :func:`misfit`.
     explained : whether a significant model discrepancy explains the scatter of heights; the
         standard deviations then contain it.
     others : findings of any level about the session.
@@ -133,16 +132,18 @@ def assess(
         sigma, nominal = platform_sigma(estimate), identification.by_nominal
         no_better = tuple(_no_gain("platform", sigma, nominal, options))
     negligible = negligible_shift(estimate.machine.parameters)
+    # edges that another method leaves far off, and heights that the bed explains
+    by_method = method != "bundle" and estimate.statistics.noise_scale > options.too_noisy
+    without = ["edges"] * by_method + ["poses"] * explained
     # all findings, in the order of the report
     every = (
-        *_estimate_misfit(estimate, method, options),
+        *_poor_estimate(estimate, method, by_method=by_method),
+        *misfit(estimate, labels, richer, without, options),
         *(undetermined if refused else no_better),
         *_singular(estimate, options),
         *_readings_misfit(estimate, options),
-        *(() if explained else _poses_misfit(estimate, richer, options)),
         *_warnings(observation, estimate, options),
         *(_touch_unnoticed(bed, options) if bed else ()),
-        *_few_configurations(estimate, options),
         *(_not_by_heights(bed, identification, negligible) if bed else ()),
         *others,
         *(() if refused else undetermined),
@@ -250,22 +251,13 @@ def _not_by_heights(
         )
 
 
-def _estimate_misfit(estimate: Estimate, method: str, options: VerdictOptions) -> Iterator[Finding]:
-    """Findings on edges that the model does not explain, and on an estimate without convergence or
-    redundancy.
+def _poor_estimate(estimate: Estimate, method: str, *, by_method: bool) -> Iterator[Finding]:
+    """Findings on an estimate without convergence or redundancy, or by a method whose edges are far
+    off.
     """
     s = estimate.statistics
-    rejected = (
-        float(np.mean(estimate.edge_weights < INLIER_WEIGHT)) if estimate.edge_weights.size else 0.0
-    )
-    # edges
-    if s.noise_scale > options.too_noisy and method != "bundle":
+    if by_method:
         yield wrong("estimate.method_misfit", method=method, scale=s.noise_scale)
-    elif s.noise_scale > options.too_noisy:
-        yield wrong("edges.misfit", scale=s.noise_scale)
-    if rejected > options.too_many_rejected:
-        yield wrong("edges.rejected_share", share=rejected, limit=options.too_many_rejected)
-    # the estimate itself
     if s.dof <= 0:
         yield wrong("estimate.no_redundancy", dof=s.dof)
     if s.stopped == Stop.STEPS.value:
@@ -318,30 +310,35 @@ def _base_alone(estimate: Estimate) -> Finding:
     return wrong("estimate.base_only", sigma=both, edges_sigma=edges, nominal_sigma=prior)
 
 
-def _poses_misfit(
-    estimate: Estimate, richer: RicherModel | None, options: VerdictOptions
+def misfit(
+    estimate: Estimate,
+    labels: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    richer: RicherModel | None = None,
+    without: Collection[str] = (),
+    options: VerdictOptions = VERDICT,
 ) -> Iterator[Finding]:
-    """Findings on poses that the model does not explain: noise scale too large, too many rejected,
-    or more scatter than stated.
+    """Findings on measurements that the model does not explain, that scatter more than stated, or
+    of which many are rejected, by groups of rows with one noise scale.
 
-    richer : model that explains the poses, for the message.
+    labels : names of the measurements in a group, in the plural; the group's own by default.
+    richer : the model that explains the poses. without : groups that are judged otherwise.
     """
-    s = estimate.statistics
-    better = {"model": richer and richer.name, "model_scale": richer and richer.scale}
-    if s.pose_scale > options.too_noisy:
-        yield wrong("poses.misfit", scale=s.pose_scale, **better)
-    share = (
-        float(np.mean(estimate.pose_weights < INLIER_WEIGHT)) if estimate.pose_weights.size else 0.0
-    )
-    if share > options.too_many_rejected:
-        yield wrong("poses.rejected_share", share=share, limit=options.too_many_rejected)
-    if usual_scale(s.dof_poses) < s.pose_scale <= options.too_noisy:
-        yield doubtful("poses.scatter", scale=s.pose_scale, **better)
-
-
-def usual_scale(dof: float) -> float:
-    """Largest noise scale of poses, or of links, that causes no finding."""
-    return max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(Search.POSE_NOISE, dof))
+    for group in estimate.statistics.groups:
+        weights = estimate.weights.get(group.name, np.zeros(0))
+        if not weights.size or group.name in without:
+            continue
+        names = labels.get(group.name) or [group.name]
+        facts: dict[str, Any] = {"group": group.name, "names": names, "scale": group.scale}
+        if richer and group.name == "poses":
+            facts |= {"model": richer.name, "model_scale": richer.scale}
+        if group.scale > options.too_noisy:
+            yield wrong("data.misfit", listed(names), **facts)
+        elif group.scale > SESSION_FALSE_ALARM.usual_scale(group.dof):
+            yield doubtful("data.scatter", listed(names), **facts)
+        share, limit = float(np.mean(weights < INLIER_WEIGHT)), options.too_many_rejected
+        if share > limit:
+            facts = {"names": names, "share": share, "limit": limit}
+            yield wrong("data.rejected_share", listed(names), **facts)
 
 
 def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
@@ -436,11 +433,12 @@ def _warnings(
     in_view = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
     for leg in np.flatnonzero(in_view < options.few_edges_share * np.median(in_view)).tolist():
         yield doubtful("edges.leg_seldom_seen", f"leg {leg + 1}", leg=leg + 1)
-    if estimate.statistics.noise_scale > options.edge_scatter:
-        yield doubtful("edges.scatter", scale=estimate.statistics.noise_scale)
     shading = estimate.edge_noise.shading if observation.edges.leg.size else np.zeros(1)
     if shading.min() > POLISHED_SHADING:
         yield doubtful("edges.polished", value=float(shading.min()))
+    used = int(np.sum(estimate.configurations))
+    if used < options.few_configurations and not only_heights(estimate):
+        yield note("configurations.few", number=used)
 
 
 def _from_nominal(machine: Machine) -> Array:
@@ -454,10 +452,3 @@ def _from_nominal(machine: Machine) -> Array:
     frames = generators(machine.layout, table.nominal) @ freedoms(machine)
     frames = frames / table.tolerance[:, None]
     return change - frames @ np.linalg.lstsq(frames, change, rcond=None)[0]
-
-
-def _few_configurations(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
-    """Note if few configurations are in use."""
-    used = int(np.sum(estimate.configurations))
-    if used < options.few_configurations and not only_heights(estimate):
-        yield note("configurations.few", number=used)

@@ -32,6 +32,7 @@ from pkmcal.judge.causes import (
 from pkmcal.judge.fixed_machine import Evidence
 from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms import Machine
+from pkmcal.outcome.hypotheses import OPTIONS
 from pkmcal.ranges import default
 
 CHANGE_ALPHA: float = default("watch", "alpha")
@@ -44,10 +45,8 @@ DETECTION_POWER = 0.9
 """Probability with which a detectable change is detected."""
 WATCH_NOISE_DRAWS = 20_000
 """Number of draws of noise: a share of 0.01 of them is known to a relative 7 %."""
-DISTINCT_LOG_ODDS = 2 * np.log(100.0)
-"""Two causes are distinguished if one makes the data a hundred times as likely as the other (twice
-the log odds).
-"""
+DISTINCT_LOG_ODDS = 2 * OPTIONS.act
+"""Twice the log-odds, nats, from which one cause excludes another."""
 MOST_CAUSES = 4
 """Maximum number of changes that are identified; more occur in a machine that was taken apart."""
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers, rms
 from pkmcal.judge.prediction import Prediction, ReadingErrors, errors_on
-from pkmcal.levels import NOISE_EXCESS
+from pkmcal.levels import FALSE_ALARM, NOISE_EXCESS
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import nonzero
@@ -20,8 +20,6 @@ RATIO_BOOTSTRAP_DRAWS = 4000
 """Number of bootstrap draws: percentiles of the ratio are known to a hundredth or two."""
 RATIO_INTERVAL_PROBABILITY = 0.95
 """Probability of the stated interval of the ratio."""
-UNEXPLAINED_RESIDUAL_CHANCE = 1e-3
-"""p-value below which the standard deviations do not explain the residuals."""
 
 
 @dataclass(frozen=True)
@@ -277,10 +275,8 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
         common=common,
         common_sigma=np.sqrt(np.diag(spread)),
         common_chance=float(chdtrc(dof_common, chi2_common)),
-        usual=bool(chdtrc(dof, chi2 / NOISE_EXCESS**2) > UNEXPLAINED_RESIDUAL_CHANCE),
-        steady=bool(
-            chdtrc(dof_common, chi2_common / NOISE_EXCESS**2) > UNEXPLAINED_RESIDUAL_CHANCE
-        ),
+        usual=bool(chdtrc(dof, chi2 / NOISE_EXCESS**2) > FALSE_ALARM),
+        steady=bool(chdtrc(dof_common, chi2_common / NOISE_EXCESS**2) > FALSE_ALARM),
         expected=np.sqrt(np.diag(covariance)).reshape(shape),
         by_noise=np.sqrt(np.maximum(np.diag(noise), 0.0)).reshape(shape),
     )

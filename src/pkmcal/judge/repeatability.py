@@ -41,9 +41,6 @@ from pkmcal.outcome.progress import Progress, no_progress
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.solver.ranks import nonzero
 
-LEGS_BETTER_SHARE = 0.1
-"""Share by which separate motions of the legs must explain more than one motion of the whole to
-be the cause."""
 MOSTLY_COMMON = 0.5
 """Scatter, relative to the images' own estimate, below which averaging repeats gains less than
 an eighth."""
@@ -116,7 +113,7 @@ class StationScatter:
         """
         best = "camera" if self.camera >= self.platform else "platform"
         whole = max(self.camera, self.platform)
-        if self.legs > max(CAUSE_SHARE, whole + LEGS_BETTER_SHARE):
+        if self.legs > CAUSE_SHARE and whole < NEARLY_ALL * self.legs:
             return "legs"
         return best if whole > CAUSE_SHARE else "noise"
 

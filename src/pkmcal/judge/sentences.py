@@ -24,14 +24,13 @@ from pkmcal.judge.changes import (
     Suspect,
 )
 from pkmcal.judge.comparison import (
-    UNEXPLAINED_RESIDUAL_CHANCE,
     NominalComparison,
     Ratio,
     finite_rms,
     improvement_ratio,
 )
 from pkmcal.judge.holdouts import HoldOut
-from pkmcal.levels import NOISE_EXCESS
+from pkmcal.levels import FALSE_ALARM, NOISE_EXCESS
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
@@ -50,8 +49,6 @@ from pkmcal.wording import (
 
 MOSTLY_NOISE = 2**0.5
 """Factor on the noise of images within which noise is more than half of the mean square."""
-POOR_REGION_FACTOR = 2.0
-"""Ratio of a region's errors to those of the used configurations from which it is reported."""
 STEEL_EXPANSION = 12e-6
 """Thermal expansion of steel, 1/K, to illustrate a common scale."""
 MOST_OTHERS = 4
@@ -221,7 +218,7 @@ def _region_findings(holdouts: Sequence[HoldOut], unit: str | None) -> list[Find
     out: list[Finding] = []
     for holdout in holdouts:
         off, usual = finite_rms(holdout.left_out.after), finite_rms(holdout.used.after)
-        if off >= POOR_REGION_FACTOR * usual:
+        if off > NOISE_EXCESS * usual:
             out.append(
                 doubtful(
                     "validation.extrapolation",
@@ -381,7 +378,12 @@ def _change_verdict(
         return Verdict(False, headline, (wrong("watch.another_machine", **facts), *warnings))
     if not findings:
         headline = "The machine is not as calibrated."
-        return Verdict(False, headline, (_unidentified_finding(judged), *warnings))
+        legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
+        facts = {"chi2": judged.machine.chi2, "dof": judged.machine.dof}
+        unidentified = wrong("watch.machine_test_fails", **facts)
+        if legs:
+            unidentified = wrong("watch.leg_test_fails", _leg_names(legs), legs=_leg_names(legs))
+        return Verdict(False, headline, (unidentified, *warnings))
     lens = all(f.suspect.cause.part == "camera" for f in findings)
     if lens:
         headline = (
@@ -391,7 +393,7 @@ def _change_verdict(
     else:
         headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
     reasons = [_cause_finding(f, k, names) for k, f in enumerate(findings)]
-    if judged.rest.dof and judged.rest.chance < UNEXPLAINED_RESIDUAL_CHANCE:
+    if judged.rest.dof and judged.rest.chance < FALSE_ALARM:
         remainder = {"chi2": judged.rest.chi2, "dof": judged.rest.dof, "chance": judged.rest.chance}
         reasons.append(wrong("watch.unexplained", **remainder))
     return Verdict(False, headline, (*reasons, *warnings, _next_step(findings)))
@@ -432,14 +434,6 @@ def _cause_finding(value: Explanation, place: int, names: Names) -> Finding:
     if cause.part in ("zero", "lead", "camera"):
         return wrong(f"watch.{cause.part}", subject, **facts)
     return wrong("watch.part", subject, **facts)
-
-
-def _unidentified_finding(judged: ChangeTests) -> Finding:
-    """Finding of a change without an identified cause."""
-    legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
-    if legs:
-        return wrong("watch.leg_test_fails", _leg_names(legs), legs=_leg_names(legs))
-    return wrong("watch.machine_test_fails", chi2=judged.machine.chi2, dof=judged.machine.dof)
 
 
 def _next_step(findings: Sequence[Explanation]) -> Finding:

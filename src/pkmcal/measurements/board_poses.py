@@ -20,4 +20,5 @@ class BoardPoses(ImageKind):
     label: ClassVar = "boards"
     unit: ClassVar = "m or rad"
     numbers: ClassVar = 6
+    rows: ClassVar = "poses"
     observe: ClassVar = "board"

@@ -61,6 +61,7 @@ class MeasurementKind(ABC):
     label : plural of the name.
     unit : unit of the numbers.
     numbers : largest number of residuals of one measurement.
+    rows : group of the residuals, which has one noise scale.
     joins : number of configurations on which one measurement depends.
     default_sigma : standard deviation where a session states none, in ``unit``; None where it has
         to be stated.
@@ -72,6 +73,7 @@ class MeasurementKind(ABC):
     label: ClassVar[str]
     unit: ClassVar[Literal["px", "m", "rad", "m or rad"]]
     numbers: ClassVar[int]
+    rows: ClassVar[Literal["edges", "poses", "readings", "links"]]
     joins: ClassVar[int] = 1
     default_sigma: ClassVar[float | None] = None
     own_sigma: ClassVar[str] = ""
@@ -93,6 +95,7 @@ class MotorKind(MeasurementKind):
     """
 
     key: ClassVar[str]
+    rows: ClassVar = "readings"
 
 
 class TargetKind(MeasurementKind, ABC):
@@ -107,6 +110,7 @@ class TargetKind(MeasurementKind, ABC):
 
     headers: ClassVar[tuple[tuple[str, ...], ...]]
     units: ClassVar[Mapping[str, str]] = COLUMN_UNITS
+    rows: ClassVar = "poses"
     known: ClassVar[tuple[int, ...]]
     fewest_rows: ClassVar[int]
     levels: ClassVar[bool] = False
@@ -171,6 +175,7 @@ class LinkKind(MeasurementKind, ABC):
     key: ClassVar[str]
     schema: ClassVar[type[Schema]]
     numbers: ClassVar = 1
+    rows: ClassVar = "links"
     joins: ClassVar = 2
 
     @classmethod

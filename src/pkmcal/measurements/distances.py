@@ -26,6 +26,7 @@ from pydantic import Field
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import Metres, PairTable, Schema, read_pairs
+from pkmcal.levels import OTHER_UNIT_RATIO
 from pkmcal.measurements.contract import (
     LEAST_NOISE,
     NOISE_FIELD_RANGE,
@@ -39,9 +40,6 @@ END_COLUMNS, VALUE_COLUMN, SIGMA_COLUMN = ("from", "to"), "distance", "sigma"
 LONGEST_IN_SIZES = 4.0
 """Largest plausible distance, relative to the machine's size: a tool reaches no further than the
 machine's size to either side, and a nominal model may be wrong by a factor of two."""
-OTHER_UNIT_RATIO = 10.0
-"""Ratio of measured to nominal distances, or its inverse, beyond which all of them are in another
-unit: inches for millimetres make 25.4, and no nominal model is wrong by a factor of ten."""
 
 
 class DistancesDocument(Schema):

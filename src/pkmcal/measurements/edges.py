@@ -46,6 +46,7 @@ class Edges(ImageKind):
     label: ClassVar = "edges"
     unit: ClassVar = "px"
     numbers: ClassVar = 2
+    rows: ClassVar = "edges"
     observe: ClassVar = "legs"
 
 

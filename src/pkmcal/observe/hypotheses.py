@@ -63,12 +63,13 @@ SEARCH_OPTIONS = HypothesisOptions(beam=math.inf, most=3)
 OTHER_EXPLANATIONS = 4
 """Number of explanations of images other than mistakes in the readings: shifted, under other names,
 mirrored, diameters for radii."""
-NEAR_SEARCH_TURN = np.radians(15.0)
+NEAR_SEARCH_TURN = LOCALIZATION_OPTIONS.far.turn
 """Rotation (rad) between localized and rough pose above which hypotheses are searched about the
-rough pose too."""
-OTHER_POSE_TURN = np.radians(45.0)
+rough pose too: the standard deviation of rough poses."""
+OTHER_POSE_TURN = np.radians(60.0) - NEAR_SEARCH_TURN
 """Rotation (rad) between localized and rough pose above which the two contradict each other: a
-machine of three or six equal parts looks the same from both."""
+machine of six equal parts looks the same from 60 degrees aside, and rough poses are off by their
+standard deviation."""
 NAMING_ROUNDS = 3
 """Alternations of the names of images, or the constant of a motor, and the camera's pose."""
 CONSTANTS_COMPARED = 17

@@ -34,9 +34,6 @@ class RepeatOptions:
     # distance of a repeat from the others, in standard deviations, beyond which it is rejected
     # (statistical: 6 in 10^7 of normal errors)
     far: float = CONTRADICTION_SIGMAS
-    # distance, in stated standard deviations, within which a repeat is an inlier however well the
-    # others agree
-    harmless: float = 1.0
     # share of a configuration's repeats that must be exceeded by those with an edge: edges that
     # are measured now and then are faint, and may well be a pixel off
     majority: float = MAJORITY
@@ -256,7 +253,8 @@ def outlying_repeats(
         scaled = scaled - groups.mean(scaled)[groups.member]
         variance = groups.total(scaled * scaled) / freedom / (1 - 2 / (9 * freedom)) ** 3
         spread = np.sqrt(np.median(variance[several], axis=0))
-    far = (away > options.far * spread * unit) & (away > options.harmless * stated)
+    # within its stated noise a repeat is an inlier however well the others agree
+    far = (away > options.far * spread * unit) & (away > stated)
     far = far.any(axis=1)
     count = groups.count[groups.member]
     photos = groups_of(edges.station, edges.configuration)

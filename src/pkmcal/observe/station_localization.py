@@ -40,6 +40,7 @@ from pkmcal.observe.shadows import (
     lightness,
     without_shadows,
 )
+from pkmcal.outcome.hypotheses import OPTIONS
 
 
 @dataclass(frozen=True)
@@ -143,11 +144,11 @@ class LocalizationOptions:
     early: float = 1e-4
     # probability of so large a likelihood by chance below which the machine is localized without a
     # prior (statistical)
-    false_alarm: float = 1e-3
+    false_alarm: float = math.exp(-OPTIONS.act)
     # the same near a hand-placed pose, which is evidence itself (statistical)
     false_alarm_with_prior: float = 1e-2
     # probability of a second pose above which neither is accepted (statistical)
-    rival: float = 0.05
+    rival: float = math.exp(-OPTIONS.report)
     # grid of candidates without a prior
     candidates: CandidateOptions = CANDIDATE_OPTIONS
     # detection of shadows among the poses

@@ -42,13 +42,6 @@ def tool_variance(weight: Array, covariance: Array) -> Array:
     return np.einsum("ij,...ij->...", weight, covariance)
 
 
-def _root(matrix: Array) -> Array:
-    """F (p, k) with F F^T = matrix, without directions of negligible eigenvalues."""
-    eigenvalues, eigenvectors = np.linalg.eigh(matrix)
-    significant = eigenvalues > 1e-12 * eigenvalues[-1]
-    return eigenvectors[:, significant] * np.sqrt(eigenvalues[significant])
-
-
 class Greedy(NamedTuple):
     """Greedy selection.
 
@@ -108,7 +101,11 @@ class _Work:
         self._information = info.information / np.outer(self._unit, self._unit)
         self._directions = info.machine / self._unit
         self._weight = tool_weight(info)
-        self._slope = self._directions.T @ _root(self._weight)
+        # F with F F^T = weight, without directions of negligible eigenvalues
+        eigenvalues, eigenvectors = np.linalg.eigh(self._weight)
+        significant = eigenvalues > 1e-12 * eigenvalues[-1]
+        root = eigenvectors[:, significant] * np.sqrt(eigenvalues[significant])
+        self._slope = self._directions.T @ root
         self._covariance = np.zeros_like(self._information)
 
     def begin(self, chosen: list[int]) -> None:

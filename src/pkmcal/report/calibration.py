@@ -29,7 +29,6 @@ from pkmcal.identify.tool import ToolAccuracy, centres_and_tool, platform_sigma
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.levels import CONTRADICTION_SIGMAS, ROUNDING
 from pkmcal.measurements import LinkSet, Observation
-from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome
 from pkmcal.outcome.blocks.log_bar import LogBar, Magnitude
 from pkmcal.outcome.finding import Level, Mark
@@ -286,29 +285,19 @@ def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
             f" {amount(share * findings.by_nominal, 'm')}: {share:.0%} of what the tolerances give",
             judged("platform.no_gain", "machine.undetermined"),
         )
-    weights = np.concatenate([estimate.edge_weights, estimate.pose_weights])
+    weights = np.concatenate([*estimate.weights.values()])
     if weights.size:
         rejected = float(np.mean(weights < INLIER_WEIGHT))
         limits[DATA_QUESTION] = (
             f"{rejected:.0%} rejected, limit {VERDICT.too_many_rejected:.0%}",
-            judged("edges.rejected_share", "poses.rejected_share", "edges.leg_seldom_seen"),
+            judged("data.rejected_share", "edges.leg_seldom_seen"),
         )
-    scales = [
-        one
-        for one, n in (
-            (statistics.noise_scale, statistics.n_edges),
-            (statistics.pose_scale, statistics.n_poses),
-        )
-        if n
-    ]
+    scales = [one.scale for one in statistics.groups if one.n and one.name in estimate.weights]
     if scales and statistics.dof > 0 and calibration.method == "bundle":
         limits[FIT_QUESTION] = (
             f"noise {number(max(scales), 2)} times as stated, limit {VERDICT.too_noisy:g} times",
-            judged(
-                "edges.misfit", "edges.scatter", "poses.misfit", "poses.scatter",
-                "readings.misfit",
-            ),
-        )  # fmt: skip
+            judged("data.misfit", "data.scatter", "readings.misfit"),
+        )
     return limits
 
 
@@ -471,8 +460,7 @@ def _data(
     if not taken:
         weights = np.concatenate([estimate.pose_weights, estimate.link_weights])
         quiet, n = int(np.sum(weights < INLIER_WEIGHT)), len(weights)
-        kinds = sorted({table.target.label for table in session.trackers})
-        kinds += [measurement_kinds()[links.kind].label for links in session.links]
+        kinds = [label for rows in estimate.weights for label in session.labels.get(rows, ())]
         return Figure(
             DATA_QUESTION,
             ((f"{n - quiet} of {n}", " and ".join(kinds)),),
@@ -507,10 +495,7 @@ def _fit(session: Session, estimate: Estimate) -> Figure:
     scaled = [
         f"the {what}' stated noise was multiplied by {number(scale, 2)}"
         for what, scale in (
-            ("edges", s.noise_scale),
-            ("poses", s.pose_scale),
-            ("readings", s.reading_scale),
-            (provenance.link_labels(session), s.link_scale),
+            (provenance.group_label(session, one.name), one.scale) for one in s.groups
         )
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.arrays import Array
 from pkmcal.calibration.heights import ProbedHeights
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.outcome.blocks.base import configuration_key
@@ -22,7 +21,9 @@ def section(session: Session, heights: ProbedHeights) -> Part | None:
     if not len(heights):
         return None
     used = heights.used
-    before, after = (_rms(values[used]) for values in (heights.before, heights.after))
+    before, after = (
+        float(np.sqrt(np.nanmean(values[used] ** 2))) for values in (heights.before, heights.after)
+    )
     rejected = "" if used.all() else f" {count(int(np.sum(~used)), 'height')} rejected."
     summary = (
         f"{count(int(used.sum()), 'height')}: {amount(before, 'm')} off by the nominal model,"
@@ -96,8 +97,3 @@ def _table(session: Session, heights: ProbedHeights) -> Table:
         brief=False,
         words=(7,),
     )
-
-
-def _rms(values: Array) -> float:
-    """Root mean square of the finite values."""
-    return float(np.sqrt(np.nanmean(values**2)))

@@ -12,10 +12,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.results import base_camera_covariance, versions
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import Estimate, GroupStatistics
 from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, Rejection
-from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.overlays import EDGE_SIDE_NAMES
 from pkmcal.outcome import Part, Row, Table
@@ -200,7 +199,8 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     noise = estimate.edge_noise
     tubes = zip(noise.scale, noise.shading, noise.dof, strict=True)
     units = dict.fromkeys(session.machine.joint_units)
-    linked = link_labels(session)
+    groups = [one._replace(name=group_label(session, one.name)) for one in s.groups]
+    nominal = GroupStatistics("nominal model", 1.0, s.chi2_drawing, s.n_drawing, 0.0, None)
     return (
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
@@ -210,29 +210,18 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
         ("Solver", f"{count(s.steps, 'step')}; {s.stopped}"),
         *(
             (
-                f"χ² of the {name}",
-                f"{number(chi2, 0)} over {number(n, 0)} numbers"
+                f"χ² of the {one.name}",
+                f"{number(one.chi2, 0)} over {number(one.n, 0)} numbers"
                 # redundancy of the kind, where it was counted
-                + (f", {count(round(freedom), 'degree')} of freedom" if freedom >= 0.5 else ""),
+                + (f", {count(round(one.dof), 'degree')} of freedom" if one.dof >= 0.5 else ""),
             )
-            for name, chi2, n, freedom in (
-                ("edges", s.chi2_edges, s.n_edges, s.dof_edges),
-                ("poses", s.chi2_poses, s.n_poses, s.dof_poses),
-                ("readings", s.chi2_joints, s.n_joints, s.dof_joints),
-                (linked, s.chi2_links, s.n_links, s.dof_links),
-                ("nominal model", s.chi2_drawing, s.n_drawing, 0.0),
-            )
-            if n
+            for one in (*groups, nominal)
+            if one.n
         ),
         *(
-            (f"Factor on the {name}' stated noise", number(scale, 2))
-            for name, scale, n in (
-                ("edges", s.noise_scale, s.n_edges),
-                ("poses", s.pose_scale, s.n_poses),
-                ("readings", s.reading_scale, s.n_joints),
-                (linked, s.link_scale, s.n_links),
-            )
-            if n
+            (f"Factor on the {one.name}' stated noise", number(one.scale, 2))
+            for one in groups
+            if one.n
         ),
         *(
             (
@@ -249,15 +238,12 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
         ),
         *(
             (
-                f"What the data allow of the {name}' stated noise",
+                f"What the data allow of the {one.name}' stated noise",
                 f"{brief(low) if low else '0'} to {'any' if high is None else brief(high)} times",
             )
-            for name, (low, high), n in (
-                ("poses", s.pose_range, s.n_poses),
-                ("readings", s.reading_range, s.n_joints),
-                (linked, s.link_range, s.n_links),
-            )
-            if n
+            for one in groups
+            if one.n and one.noise_range
+            for low, high in [one.noise_range]
         ),
     )
 
@@ -270,9 +256,9 @@ def _tolerances(tolerance: NominalTolerance) -> str:
     )
 
 
-def link_labels(session: Session) -> str:
-    """Kinds of links in the session, in the plural."""
-    return " and ".join(measurement_kinds()[links.kind].label for links in session.links)
+def group_label(session: Session, rows: str) -> str:
+    """Kinds of measurements in a group of rows, in the plural; the group's name for readings."""
+    return " and ".join(session.labels.get(rows, [rows]))
 
 
 @dataclass(frozen=True)

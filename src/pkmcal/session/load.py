@@ -200,6 +200,17 @@ class Session:
         return felt and not self.stations
 
     @property
+    def labels(self) -> dict[str, list[str]]:
+        """Plurals of the kinds of measurements besides the readings, by group of rows."""
+        observed = {word for station in self.stations for word in station.observe}
+        used = {measured.kind for measured in (*self.trackers, *self.links)}
+        labels: dict[str, list[str]] = {}
+        for code, kind in measurement_kinds().items():
+            if code in used or getattr(kind, "observe", "") in observed:
+                labels.setdefault(kind.rows, []).append(kind.label)
+        return labels
+
+    @property
     def station_names(self) -> tuple[str, ...]:
         """Names of all stations, trackers last, in the order of station numbers."""
         return tuple(station.name for station in (*self.stations, *self.trackers))

@@ -16,13 +16,10 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, closest, read_csv
+from pkmcal.levels import OTHER_UNIT_RATIO
 from pkmcal.measurements import PoseSet
 from pkmcal.measurements.contract import TargetKind, configuration_rows, kinds_of
 from pkmcal.wording import listed
-
-OTHER_UNIT_SPREAD_FACTOR = 30.0
-"""Ratio of a table's spread to the machine's own motion above which its lengths are in another
-unit."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +189,7 @@ def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
         return
     measured = table.target.lengths(table.T)
     spread = float(np.max(np.std(measured, axis=0)))
-    if spread <= OTHER_UNIT_SPREAD_FACTOR * max(motion, 1e-6):
+    if spread <= OTHER_UNIT_RATIO * max(motion, 1e-6):
         return
     raise InputError(
         "the table's lengths look like millimetres",

@@ -155,7 +155,8 @@ class NominalModel:
         comment = "\n".join(f"# {line}".rstrip() for line in lines)
         sigma = self.sigma
         if sigma is None:
-            sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
+            lengths = [np.linalg.norm(x.platform + self.home - x.start) for x in self.legs]
+            sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(max(lengths)))
         return (
             f"{comment}\nname: {self.name}\nmotion: {self.motion}\n\n"
             f"{frames}Replace any centre by a better one.\nlegs:\n"
@@ -185,10 +186,6 @@ class NominalModel:
                 found=self.name,
                 expected=expected,
             )
-
-    def _lengths(self) -> Array:
-        """Distances (L,) of A and B at home, m."""
-        return np.array([np.linalg.norm(x.platform + self.home - x.start) for x in self.legs])
 
     def _leg_text(self, leg: NominalLeg) -> str:
         """Entry of a leg."""

@@ -89,8 +89,9 @@ def edge_search(content: SessionContent, request: ViewRequest) -> EdgesAnswer:
         reason = f"The board is not detected: {detection.reason}."
         texts.append(f"The board: {n} detected." if detection.success else reason)
         marks.append("good" if detection.success else Level.WRONG)
+    order: tuple[Mark, ...] = ("good", Level.DOUBTFUL, Level.WRONG)
     return EdgesAnswer(
-        mark=_worst(marks),
+        mark=max((mark for mark in marks if mark is not None), key=order.index, default=None),
         texts=tuple(texts),
         legs=tuple(_leg_counts(result, pane.machine.n_legs)),
         reasons=tuple(_reasons(result.missing)),
@@ -101,12 +102,6 @@ def edge_search(content: SessionContent, request: ViewRequest) -> EdgesAnswer:
             Layer(name="corners", shapes=tuple(Cross(at=at) for at in corners)),
         ),
     )
-
-
-def _worst(marks: list[Mark | None]) -> Mark | None:
-    """The worst of some marks, None without any."""
-    order: tuple[Mark, ...] = ("good", Level.DOUBTFUL, Level.WRONG)
-    return max((mark for mark in marks if mark is not None), key=order.index, default=None)
 
 
 def _leg_counts(result: _LegEdges, n: int) -> list[LegCount]:

@@ -27,9 +27,9 @@ from pkmcal.identify.methods.registration import (
     points_by,
 )
 
-COLLAPSED_LENGTH_SHARE = 0.5
-"""Length of a constant leg, relative to its nominal length, below which it is in the false minimum
-B = A."""
+COLLAPSED_LENGTH_SHARE = 1 / 2
+"""Length of a constant leg, relative to its nominal length, below which it is nearer to the false
+minimum B = A than to the nominal length."""
 TORSION_NOISE_TOLERANCES = 20.0
 """Prior sigmas by which the nominal axes are weakened while the torsion's noise is estimated."""
 TORSION_STEPS, TORSION_SETTLED = 40, 1e-13
