@@ -228,5 +228,5 @@ def _with_verdict(d: CameraDifference, largest: float) -> CameraDifference:
         findings.append(wrong("difference.cameras", d.b.name, value=middle, largest=largest))
     without = [one.name for one in (d.a, d.b) if one.camera.covariance is None]
     if without:
-        findings.append(note("difference.no_covariance", names=without))
+        findings.append(note("difference.no_covariance", names=without, matters=False))
     return replace(d, verdict=Verdict(not d.changed, headline, tuple(findings)))
