@@ -99,6 +99,7 @@ def camera_difference(a: Camera | Path | str, b: Camera | Path | str) -> CameraD
             found=f"{other.camera.image_size[0]} x {other.camera.image_size[1]}",
             expected=f"{one.camera.image_size[0]} x {one.camera.image_size[1]}, as in {one.name}",
             next_step="Compare calibrations from images of one size",
+            code="difference.image_sizes",
         )
     pixels = pixel_grid(one.camera.image_size, CAMERA_CELLS)
     rays = one.camera.ray(pixels)
