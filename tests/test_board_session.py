@@ -262,8 +262,9 @@ def test_another_board_than_described(folder):
     path = folder / "board.yaml"
     path.write_text(path.read_text().replace("DICT_4X4_50", "DICT_5X5_50"))
     session = load_session(folder)
-    with pytest.raises(InputError, match="another board than the one described") as caught:
+    with pytest.raises(InputError) as caught:
         boards_of(session, read_images(session))
+    assert caught.value.code == "board.another"
     assert caught.value.where == "session.yaml, stations.station1: 0000.png"
     assert "markers of DICT_4X4_50" in caught.value.found
 

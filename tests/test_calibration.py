@@ -142,8 +142,9 @@ def test_diameters_for_radii_are_named_where_the_machine_was_localized(demo, sta
     session = load_session(demo.session)
     thick = of_twice_the_radii(session.machine)
     session = replace(session.of_stations(range(stations)), machine=thick)
-    with pytest.raises(InputError, match="radii look like diameters"):
+    with pytest.raises(InputError) as error:
         pkmcal.calibrate(session)
+    assert error.value.code == "tube.diameter"
 
 
 @pytest.mark.slow
@@ -155,8 +156,9 @@ def test_diameters_are_named_where_few_edges_happen_to_agree(tmp_path, seed):
     simulate_session(tmp_path, machine, camera_of_size((640, 480)), settings, seed=101)
     session = load_session(tmp_path)
     thick = of_twice_the_radii(session.machine)
-    with pytest.raises(InputError, match="radii look like diameters"):
+    with pytest.raises(InputError) as error:
         pkmcal.calibrate(replace(session, machine=thick), seed=seed)
+    assert error.value.code == "tube.diameter"
 
 
 def test_one_station_alone(demo, calibrated):

@@ -24,12 +24,9 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.measurements import Observation, concatenate
-from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.legs import measure
 from pkmcal.observe.profiles import PROFILE_OPTIONS
-from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session
-from pkmcal.simulation import Settings, simulate_session
 from pkmcal.wording import how_often
 from test_observe_measure import taken
 from test_observe_rendered_legs import FRONT, machine, poses
@@ -157,11 +154,9 @@ def test_the_machine_is_identified_by_the_other_stations(demo, monkeypatch):
     assert compare_with_truth(calibration, demo.session).calibrated.centre < 1e-3
 
 
-def test_a_localization_confirmed_by_chance_is_compared_with_mistakes(tmp_path):
+def test_a_localization_confirmed_by_chance_is_compared_with_mistakes(demo):
     """Readings in the opposite order, and a pose at which edges match by chance."""
-    nominal, settings = load_mechanism("gough-stewart"), Settings(stations=1, configurations=8)
-    simulate_session(tmp_path, nominal, camera_of_size((640, 480)), settings, seed=101)
-    session = load_session(tmp_path)
+    session = load_session(demo.session).of_stations([0])
     reversed_readings = replace(session, joints=session.joints[:, ::-1].copy())
     images = read_images(session)
     station = session.stations[0].T_camera_base

@@ -165,6 +165,27 @@ def view_of(pictures, mechanism=None, in_view=None):
     return StationView(mechanism, camera_of(), names, readings, in_view, tables)
 
 
+def test_few_images_are_tested_against_earlier_readings():
+    """Six configurations determine badly how well other readings fit by chance; thirty determine
+    it better, and images under each other's names are refused as before.
+    """
+    rng, spread = np.random.default_rng(3), np.repeat([0.15, 0.03], 3)
+    elsewhere = [perturb(poses(), rng.normal(size=(6, 6)) * spread) for _ in range(4)]
+    earlier = machine().inverse(np.concatenate(elsewhere))
+
+    def localized(names, earlier_joints):
+        view = replace(view_of([images()[k] for k in names]), earlier_joints=earlier_joints)
+        return find_station(view, rough_pose(1), np.random.default_rng(0))
+
+    few, more, exchanged = (
+        localized(*one) for one in (((0, 1, 2), None), ((0, 1, 2), earlier), ((1, 2, 0), earlier))
+    )
+    assert few.good
+    assert more.good
+    assert more.p_value < 0.1 * few.p_value
+    assert not exchanged.good
+
+
 def test_images_are_asked_under_each_name_as_if_they_bore_it():
     view, names = view_of(images()), np.array([4, 0, 3])
     fits = pose_likelihood.log_likelihood_by_name(view, FRONT, names)

@@ -279,7 +279,7 @@ def test_a_camera_compares_its_views_and_models(camera):
         ("a.png", 0.1, "quiet"), ("b.png", 0.5, "quiet"),
     ]  # fmt: skip
     plot = camera_plots.models_plot(camera)
-    assert plot.y.categories == ("pinhole", "pinhole k1 (chosen)")
+    assert plot.y.categories == ("pinhole", "✓ pinhole k1")
     fitted, held_out = (mark.points for mark in plot.marks)
     assert [point.x for point in (*fitted, *held_out)] == [0.9, 0.1, 1.0, 0.12]
     one = SimpleNamespace(**{**vars(camera), "compared": camera.compared[:1]})

@@ -670,6 +670,35 @@ def test_a_page_that_is_written_again_is_read_again(results, tmp_path):
     assert "one.html" in alone.document()["note"]
 
 
+def test_what_is_written_later_is_listed_at_the_next_request(tmp_path, demo):
+    """In its place; addresses of the entries before stay."""
+
+    def rows():
+        return {one["name"]: one for one in opened.document()["entries"]}
+
+    for name in ("b", "c"):
+        pkmcal.show("3-rpr").save(tmp_path / f"{name}.html")
+    opened = Opened(tmp_path)
+    before = rows()
+    pkmcal.show("delta").save(tmp_path / "a.html")
+    shutil.copytree(demo.session, tmp_path / "bench")
+    assert list(rows()) == ["a.html", "b.html", "c.html", "bench"]
+    assert rows()["b.html"] == before["b.html"]
+    assert opened.document(rows()["a.html"]["href"])["title"] == "delta"
+    assert opened.document(rows()["bench"]["href"])["kind"] == "session"
+    assert rows()["bench"]["text"].endswith("; not calibrated")
+    shutil.copytree(demo.calibration, tmp_path / "bench" / "calibration")
+    assert rows()["bench"]["text"].endswith("; calibrated")
+    # another page of the same name, and none at all
+    shutil.copy(tmp_path / "a.html", tmp_path / "b.html")
+    assert rows()["b.html"]["title"] == rows()["a.html"]["title"] != before["b.html"]["title"]
+    for name in ("a.html", "b.html", "c.html"):
+        (tmp_path / name).unlink()
+    shutil.rmtree(tmp_path / "bench")
+    assert rows() == {}
+    assert str(tmp_path) in opened.document()["note"]
+
+
 def test_each_entry_of_a_folder_opens(results):
     opened = Opened(results)
     kinds = {}

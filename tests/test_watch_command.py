@@ -225,6 +225,8 @@ def test_configurations_that_the_calibration_used_are_left_out(demo, later, cali
     spoiled(calibration, listed)
     value = watch_machine(calibration, session)
     assert value.as_dict()["known_configurations"] == reference_values
+    saved = load(calibration)  # few new images are localized with its readings as well
+    np.testing.assert_array_equal(value.session.earlier_joints, saved.joints[saved.used])
     assert value.as_dict()["configurations"] == list(session.configurations[2:])
     assert (
         f"made from configuration {reference_values[0]} and {reference_values[1]}"

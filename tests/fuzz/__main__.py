@@ -10,13 +10,13 @@ import sys
 import tempfile
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from unittest.mock import patch
 
 # Threads would be lost in a fork, and are slow on one core; OpenCV is set as by the command line.
 # Libraries read these variables when they are imported.
 os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "80"}
 os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
 
+from fuzz.bases import one_camera_model
 from fuzz.cases import FIRST, telling
 from fuzz.run import Summary, run, warm
 
@@ -58,8 +58,8 @@ def fuzz(given, place: Path) -> Summary:
     if given.telling:
         numbers = telling(numbers, bases, place)
     # quick cases do not compare all models of a camera
-    one = patch("pkmcal.camera_calibration.calibrate.CALIBRATED_MODELS", ("pinhole",))
-    with suppress(KeyboardInterrupt), one if max(numbers) < FIRST else nullcontext():
+    models = one_camera_model() if max(numbers) < FIRST else nullcontext()
+    with suppress(KeyboardInterrupt), models:
         for number in numbers:
             result = run(number, bases, place, keep=bool(given.only))
             summary.add(result)

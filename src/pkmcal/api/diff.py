@@ -103,6 +103,7 @@ def diff(
                 "one of the two is a camera",
                 found=f"{a} and {b}",
                 expected="two cameras' files, or two calibrations or mechanism files",
+                code="difference.kinds",
             )
         return DiffResult.of(difference(a, b))
 

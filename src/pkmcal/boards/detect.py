@@ -220,6 +220,7 @@ def _other_board_error(path: Path, other: str, board: Board) -> InputError:
         found=other,
         expected=f"{board.described}{first}, as the board file states",
         next_step="Write what the board has into the board file",
+        code="board.another",
     )
 
 

@@ -259,7 +259,10 @@ def localize_by_legs(
 
     def view(p: StationImages) -> StationView:
         tables = distance_tables(p.images)
-        return StationView(machine, p.camera, p.configuration, session.joints, poses, tables)
+        return StationView(
+            machine, p.camera, p.configuration, session.joints, poses, tables,
+            earlier_joints=session.earlier_joints,
+        )  # fmt: skip
 
     at = [p.station for p in images]
     start_poses = [station.T_camera_base for station in session.stations]

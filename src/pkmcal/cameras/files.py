@@ -110,7 +110,9 @@ def _kalibr_names(data: Mapping[str, Any]) -> list[str]:
 
 def _without_names(label: str, camera: str) -> InputError:
     """Error about a name behind a # where the file's format has one camera without a name."""
-    return InputError("the file holds no cameras with names", where=label, found=camera)
+    return InputError(
+        "the file holds no cameras with names", where=label, found=camera, code="camera.unnamed"
+    )
 
 
 def written_camera(file: str) -> str:
@@ -402,6 +404,7 @@ def ros_distortion(camera: Camera) -> tuple[str, list[float]]:
             f"ROS camera_info has no distortion model for a {name}" + ("" if word else " camera"),
             expected="pinhole, rational of eight coefficients, or fisheye",
             next_step="Write it for OpenCV or Kalibr, or calibrate with the model fisheye",
+            code="camera.not_in_format",
         )
     return word, k[: _ROS_TERMS[word]]
 

@@ -330,6 +330,7 @@ class _Includes:
                 expected="files in the configuration's own folder, with wildcards in at most"
                 f" {MOST_WILDCARD_PARTS} parts",
                 next_step="Name the file that has the printer's values without wildcards",
+                code="printer.include_wildcards",
             )
         return [folder / one for one in sorted(glob(spec, root_dir=folder))]
 

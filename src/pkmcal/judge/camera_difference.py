@@ -103,6 +103,7 @@ def camera_difference(a: Camera | Path | str, b: Camera | Path | str) -> CameraD
             found=f"{other.camera.image_size[0]} x {other.camera.image_size[1]}",
             expected=f"{one.camera.image_size[0]} x {one.camera.image_size[1]}, as in {one.name}",
             next_step="Compare calibrations from images of one size",
+            code="difference.image_sizes",
         )
     pixels = pixel_grid(one.camera.image_size, CAMERA_CELLS)
     rays = one.camera.ray(pixels)
@@ -234,5 +235,5 @@ def _with_verdict(d: CameraDifference, largest: float) -> CameraDifference:
         findings.append(wrong("difference.cameras", d.b.name, value=middle, largest=largest))
     without = [one.name for one in (d.a, d.b) if one.camera.covariance is None]
     if without:
-        findings.append(note("difference.no_covariance", names=without))
+        findings.append(note("difference.no_covariance", names=without, matters=False))
     return replace(d, verdict=Verdict(not d.changed, headline, tuple(findings)))

@@ -90,7 +90,12 @@ def measured_new_data(
     stations accordingly. seed : of the localization.
     """
     return calibrate_session(
-        replace(session, machine=saved.machine, stations=_as_calibrated(saved, session)),
+        replace(
+            session,
+            machine=saved.machine,
+            stations=_as_calibrated(saved, session),
+            earlier_joints=saved.joints[saved.used],
+        ),
         seed=seed,
         progress=progress,
     )

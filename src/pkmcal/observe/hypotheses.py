@@ -77,9 +77,11 @@ CONSTANTS_COMPARED = 17
 hypotheses."""
 FEW_CONFIGURATIONS = 4
 """Number of images in which all hypotheses about the readings are compared first."""
-ENOUGH_IMAGES_ALONE, USUAL_IMAGES = 4, 15
+ENOUGH_IMAGES_ALONE = 4
 """Number of images below which a message gives their number as the reason, because they cannot be
-divided into halves for search and test; and the usual number of images."""
+divided into halves for search and test."""
+USUAL_IMAGES, ENOUGH_IMAGES_OF_CALIBRATED = 15, 5
+"""Usual number of images of a station for a calibration; and of a calibrated machine."""
 NUMBERING = "readings.numbering_"
 """Prefix of the codes of hypotheses about the numbering of the legs."""
 STATION_PAIRS_SEARCHED = 15
@@ -187,13 +189,15 @@ def mistake(
     others = [station.name for station in bad if station is not worst]
     at = ", nor in those of " + listed(others) if others else ""
     few = len(worst.view.configuration) < ENOUGH_IMAGES_ALONE
+    calibrated = worst.view.earlier_joints is not None
+    enough = ENOUGH_IMAGES_OF_CALIBRATED if calibrated else USUAL_IMAGES
     return InputError(
         f"the machine was not localized in the images of {worst.name}{at}",
         where=f"session.yaml, stations.{worst.name}",
         found=_little(worst),
         expected="one place where its legs lie on image edges far more often than by chance",
         next_step=(
-            f"Take more images from there, {USUAL_IMAGES} are usual: with so few"
+            f"Take more images from there, {enough} are usual: with so few"
             " no exchange of images or readings can be detected. If there are more, check"
             if few
             else "Check"

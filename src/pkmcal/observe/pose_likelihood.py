@@ -92,6 +92,8 @@ class StationView:
     guessed : (H, K, L) hypothetical legs in the images, base frame, one for each candidate pose (or
         H = 1); None where the legs follow the readings.
     options : of the likelihood.
+    earlier_joints : (E, m) readings of the same machine in other sessions, None for none; rivals of
+        the images' own.
     """
 
     machine: Machine
@@ -102,6 +104,7 @@ class StationView:
     tables: DistanceTables
     guessed: LegsInCamera | None = None
     options: LikelihoodOptions = LIKELIHOOD_OPTIONS
+    earlier_joints: Array | None = None
 
     @cached_property
     def tubes(self) -> TubeList:
@@ -162,13 +165,18 @@ class StationView:
     def rivals(self, rng: np.random.Generator) -> LegsInCamera:
         """Legs (R, K, L) at readings that are not the images' own.
 
-        Each set has the readings of the configurations that follow by a fixed number of rows; if
-        the session has few, randomly displaced platforms are added.
+        Each set has the readings of the configurations that follow by a fixed number of rows, of
+        the session and then of earlier ones; if there are few, randomly displaced platforms are
+        added.
         """
-        count, own = len(self.all_joints), self.configuration
+        every, own = self.all_legs, self.configuration
+        if self.earlier_joints is not None:
+            earlier = self.machine.forward_result(self.earlier_joints).T_base_platform
+            every = every.joined(self.legs_at(earlier, self.earlier_joints))
+        count = len(every.a)
         steps = np.unique(np.linspace(1, max(count - 1, 1), self.options.most_rivals).astype(int))
         steps = steps[steps < count]
-        others = self.all_legs[(own + steps[:, None]) % count]
+        others = every[(own + steps[:, None]) % count]
         rest = max(self.options.fewest_rivals - len(steps), 0)
         if not rest:
             return others

@@ -114,7 +114,9 @@ def _values(camera: Camera) -> dict[str, tuple[str, str]]:
     sigma = np.zeros(n) if camera.covariance is None else np.sqrt(np.diag(camera.covariance))
     values = zip(camera.parameter_names, camera.parameters.tolist(), sigma.tolist(), strict=True)
     return {
-        name: (number(v, decimals(s)), brief(s)) if s > 0 else (f"{v:g}", NO_VALUE_SIGN)
+        name: (number(v, decimals(s)), brief(s))
+        if s > 0
+        else (f"{v:g}".replace("-", "−"), NO_VALUE_SIGN)
         for name, v, s in values
     }
 

@@ -161,7 +161,7 @@ def models_plot(c: CameraCalibration) -> Plot | None:
     fitted, left_out = list[Point](), list[Point]()
     for one in c.compared:
         chosen = (one.model, one.terms) == (c.camera.model, c.terms)
-        name = " ".join((one.model, *one.terms)) + (" (chosen)" if chosen else "")
+        name = ("✓ " if chosen else "") + " ".join((one.model, *one.terms))
         tip = f"{name}: fitted {brief(one.rms)} px, left out {brief(one.left_out)} px"
         for points, value in ((fitted, one.rms), (left_out, one.left_out)):
             if np.isfinite(value) and value > 0:

@@ -140,6 +140,8 @@ class Session:
     rejected : stations that were removed because their images do not determine their poses.
     links : measurements that depend on two configurations, by kind.
     temperature : (K,) °C, of the configurations; None where joints.csv has none.
+    earlier_joints : (E, m) readings of the same machine in other sessions; None for none. The
+        localization of few images is tested against them as well.
     """
 
     folder: Path
@@ -159,6 +161,7 @@ class Session:
     rejected: tuple[RejectedStation, ...] = ()
     links: tuple[LinkSet, ...] = ()
     temperature: Array | None = None
+    earlier_joints: Array | None = None
 
     def __repr__(self) -> str:
         parts = (

@@ -140,7 +140,8 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
     accuracy = f"Calibrations leave {smallest} to {largest} at the tool"
     sure = [gain for gain in gains if gain.sure]
     if not sure:
-        return f"{accuracy}; nothing of what was varied shows beyond chance in so many runs. {text}"
+        few = f"{study.runs} runs are too few to show an effect of what was varied"
+        return f"{accuracy}; {few}. {text}"
     gain = sure[0]
     return (
         f"{accuracy}; most is gained by {_name(gain.name)}: from"

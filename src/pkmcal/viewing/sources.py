@@ -11,6 +11,7 @@ from datetime import datetime
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING
 
 from pkmcal.calibration.file_names import (
@@ -24,7 +25,14 @@ from pkmcal.outcome.finding import Level, Mark
 from pkmcal.session.load import SESSION_FILE_NAME, load_session
 from pkmcal.viewing.content import SessionContent
 from pkmcal.viewing.server import session_document, session_routes
-from pkmcal.viewing.stored_pages import StoredPage, is_page, pages_in, stored_document
+from pkmcal.viewing.stored_pages import (
+    FileState,
+    StoredPage,
+    file_state,
+    is_page,
+    pages_in,
+    stored_document,
+)
 from pkmcal.web.document import (
     AnyDocument,
     FolderDocument,
@@ -163,29 +171,19 @@ def page_source(path: Path) -> Source:
 
 
 def folder_source(folder: Path) -> Source:
-    """List of the sessions and results in a folder. Raises InputError for a folder without any."""
-    places = list(islice(_places(folder, DEEPEST_RESULT), MOST_ENTRIES + 1))
-    if not places:
-        raise InputError(
-            "there is no session and no result in this folder",
-            where=str(folder),
-            expected=f"{SESSION_FILE_NAME}, or a page that a command of pkmcal wrote",
-        )
-    note = ""
-    if len(places) > MOST_ENTRIES:
-        places = places[:MOST_ENTRIES]
-        note = f"The first {MOST_ENTRIES} are listed; name a folder in it for others."
-    document = FolderDocument(
-        program=f"pkmcal {version('pkmcal')}",
-        title=resolved(folder).name,
-        entries=tuple(_entry(n, path, folder) for n, path in enumerate(places)),
-        note=note,
-    )
+    """List of the sessions and results in a folder, as it is at each request. Raises InputError for
+    a folder without any.
+    """
+    listing = FolderListing(folder)
+
+    def document() -> AnyDocument:
+        try:
+            return listing.document()
+        except PkmcalError as error:
+            return _fault_document(error)
 
     def open_place(n: int) -> Source:
-        if n >= len(places):
-            raise InputError("there is no such entry", where="the page", found=n)
-        path = places[n]
+        path = listing.path(n)
         try:
             return session_source(path) if path.is_dir() else page_source(path)
         except PkmcalError as error:
@@ -194,9 +192,58 @@ def folder_source(folder: Path) -> Source:
     def routes() -> list[BaseRoute]:
         from starlette.routing import Mount
 
-        return [*page_routes(lambda: document), Mount("/{n:int}", app=OnDemand(open_place))]
+        return [*page_routes(document), Mount("/{n:int}", app=OnDemand(open_place))]
 
-    return Source(document, routes)
+    return Source(listing.document(), routes)
+
+
+class FolderListing:
+    """Sessions and results in a folder; each keeps its number in addresses while others come."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._numbers: dict[Path, int] = {}
+        self._pages: dict[Path, tuple[FileState, FolderEntry]] = {}
+        self._lock = Lock()  # requests are answered in several threads
+
+    def document(self) -> FolderDocument:
+        """List of the folder as it is now. Raises InputError for a folder without any."""
+        places = list(islice(_places(self._folder, DEEPEST_RESULT), MOST_ENTRIES + 1))
+        if not places:
+            raise InputError(
+                "there is no session and no result in this folder",
+                where=str(self._folder),
+                expected=f"{SESSION_FILE_NAME}, or a page that a command of pkmcal wrote",
+            )
+        note = ""
+        if len(places) > MOST_ENTRIES:
+            places = places[:MOST_ENTRIES]
+            note = f"The first {MOST_ENTRIES} are listed; name a folder in it for others."
+        with self._lock:
+            entries = tuple(map(self._row, places))
+        return FolderDocument(
+            program=f"pkmcal {version('pkmcal')}",
+            title=resolved(self._folder).name,
+            entries=entries,
+            note=note,
+        )
+
+    def path(self, n: int) -> Path:
+        """Folder of a session or page of a result by its number. Raises InputError."""
+        paths = list(self._numbers)
+        if n >= len(paths):
+            raise InputError("there is no such entry", where="the page", found=n)
+        return paths[n]
+
+    def _row(self, path: Path) -> FolderEntry:
+        """Row of a place; a page that has not changed is not read again."""
+        number = self._numbers.setdefault(path, len(self._numbers))
+        if path.is_dir():
+            return _entry(number, path, self._folder)
+        state = file_state(path)
+        if path not in self._pages or self._pages[path][0] != state:
+            self._pages[path] = state, _entry(number, path, self._folder)
+        return self._pages[path][1]
 
 
 def _places(folder: Path, depth: int) -> Iterator[Path]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -16,6 +16,8 @@ from pkmcal.web.page import DOCUMENT_END, DOCUMENT_START, PAGE_MARK
 HEAD_BYTES = 1000
 """Bytes of a file in which the mark of a page stands."""
 LARGEST_PAGE_BYTES = 100_000_000
+
+FileState: TypeAlias = tuple[int, int, int] | None
 
 
 def is_page(path: Path) -> bool:
@@ -42,17 +44,17 @@ class StoredPage:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._document, self._state = stored_document(path), _file_state(path)
+        self._document, self._state = stored_document(path), file_state(path)
 
     def document(self) -> PageDocument:
         """Document of the file as it is now. Raises InputError as `stored_document`."""
-        state = _file_state(self._path)
+        state = file_state(self._path)
         if state != self._state:
             self._document, self._state = stored_document(self._path), state
         return self._document
 
 
-def _file_state(path: Path) -> tuple[int, int, int] | None:
+def file_state(path: Path) -> FileState:
     """Numbers that change when a file is written; None where it is missing."""
     try:
         status = path.stat()

@@ -68,11 +68,12 @@ def application(routes: Sequence[BaseRoute], token: str, port: int) -> Guard:
 
 def page_routes(document: Callable[[], AnyDocument]) -> list[BaseRoute]:
     """Routes of a page: its present document in its shell, and the viewer's bundle."""
+    from starlette.concurrency import run_in_threadpool
     from starlette.responses import HTMLResponse, Response
     from starlette.routing import Route
 
     async def page(_request: Request) -> Response:
-        return HTMLResponse(served_page(document()))
+        return HTMLResponse(await run_in_threadpool(lambda: served_page(document())))
 
     async def script(_request: Request) -> Response:
         return Response(bundle_file(SCRIPT_FILE), media_type="text/javascript")
