@@ -12,11 +12,15 @@ import pkmcal
 from pkmcal.cameras.files import load_camera
 from pkmcal.firmware.contract import read_printer
 from pkmcal.firmware.session import write_printer_session
+from pkmcal.geometry.rigid import from_roll_pitch_yaw, rotation
+from pkmcal.starter.families import family_model
 
 REAL = Path(__file__).with_name("real")
 CASES = {path.parent.name: yaml.safe_load(path.read_text()) for path in REAL.glob("*/case.yaml")}
 PIXEL_ROUNDING = 1e-4
 """px, of the pixels in the case files."""
+CENTRE_ROUNDING = 1e-3
+"""mm, of the joint centres in a nominal model's file."""
 MAP_ROUNDING = 6e-4
 """mm, of the mean and the standard deviation that RepRapFirmware prints."""
 
@@ -29,7 +33,7 @@ def cases(kind):
 def test_every_case_has_a_kind_and_its_origin():
     origins = (REAL / "README.md").read_text()
     folders = sorted(path.name for path in REAL.iterdir() if path.is_dir())
-    assert folders == sorted(cases("camera") + cases("heights"))
+    assert folders == sorted(cases("camera") + cases("heights") + cases("servo"))
     assert all(f"| `{name}` |" in origins for name in folders)
 
 
@@ -63,3 +67,24 @@ def test_probed_beds_of_printers(name, tmp_path):
     assert len(result.heights) == case["points"]
     assert result.verdict.usable == case["usable"]
     assert {*(one.code for one in check.findings), *result.verdict.codes} == {*case["codes"]}
+
+
+@pytest.mark.parametrize("name", cases("servo"))
+def test_servo_hexapods_of_few_numbers_move_as_by_their_owners_code(name):
+    """Home, and the angles of the arms at poses, which owners computed in other ways."""
+    case = CASES[name]
+    numbers = {
+        key: np.deg2rad(value) if key == "arm_angle" else value / 1e3
+        for key, value in case["numbers"].items()
+    }
+    machine = family_model("rotary-hexapod", numbers).machine()
+    if "home" in case:
+        assert 1e3 * machine.home()[2, 3] == pytest.approx(case["home"], abs=CENTRE_ROUNDING)
+    pair = rotation([0, 0, np.deg2rad(case["pair"])])
+    for pose_at, angles in zip(case["poses"], case["angles"], strict=True):
+        T = np.eye(4)
+        T[:3, :3] = pair.T @ from_roll_pitch_yaw(np.deg2rad(pose_at[3:])) @ pair
+        T[:3, 3] = pair.T @ np.add(pose_at[:3], [0, 0, case["height"]]) / 1e3
+        ours = np.rad2deg(machine.inverse(T[None])[0])[np.array(case["legs"]) - 1]
+        rounding = np.rad2deg(CENTRE_ROUNDING / case["numbers"]["arm"])
+        np.testing.assert_allclose(ours, angles, atol=rounding)
