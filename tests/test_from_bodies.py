@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
 
 import numpy as np
@@ -211,6 +212,57 @@ def test_mujoco_has_the_bodies_where_they_are_read():
         np.testing.assert_allclose(places[name], place, atol=1e-12)
 
 
+REPLICATED = """<mujoco><compiler eulerseq="zyx" angle="{angle}"/><worldbody>
+  <body name="plate" pos="0 0 1"><freejoint/><geom size=".1"/>
+    <replicate count="3" euler="{turn} 0 0"><site name="socket" pos=".1 0 0"/></replicate></body>
+  <frame name="f" pos="0 1 2" euler="{turn} 0 0"><replicate count="10" sep="-" offset="1 0 .2"
+    euler=".3 .2 0"><body name="far" pos=".1 0 0"><joint name="j" axis="0 1 0"/><geom size=".1"/>
+    <site name="tip" pos="0 0 1"/></body></replicate></frame>
+  <replicate count="3" euler="{turn} 0 0"><body name="leg" pos=".2 0 0"><joint name="hip"
+    axis="0 1 0"/><geom size=".1"/><replicate count="2" offset="0 .1 0"><body name="toe">
+    <joint name="knee"/><geom size=".1"/></body></replicate></body></replicate>
+</worldbody><equality><connect body1="leg" anchor="0 0 1"/><joint joint1="knee1" joint2="hip"/>
+</equality><actuator><position name="motor" joint="hip"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("angle", "turn"), [("degree", "120"), ("radian", "2")])
+def test_mujoco_has_the_copies_where_they_are_read(angle, turn):
+    mujoco = pytest.importorskip("mujoco", reason=LOUD)
+    text = REPLICATED.format(angle=angle, turn=turn)
+    theirs, model = mujoco.MjModel.from_xml_string(text), read_mujoco(text)
+    data = mujoco.MjData(theirs)
+    mujoco.mj_kinematics(theirs, data)
+    places, sites = model.places(model.key), model.site_places(model.key)
+    assert len(places) == theirs.nbody == 21
+    for k in range(theirs.nbody):
+        place = pose(data.xmat[k].reshape(3, 3), data.xpos[k])
+        np.testing.assert_allclose(places[theirs.body(k).name], place, atol=1e-12)
+    assert len(sites) == theirs.nsite
+    for k in range(theirs.nsite):
+        np.testing.assert_allclose(sites[theirs.site(k).name], data.site_xpos[k], atol=1e-12)
+    assert len(model.loops) + len(model.couplings) == theirs.neq
+    dofs = [theirs.jnt_dofadr[k] for k in theirs.actuator_trnid[:, 0]]
+    np.testing.assert_array_equal(model.actuated, dofs)
+
+
+def test_an_mjcf_in_several_files(tmp_path):
+    """Default classes, constraints and a leg are in files beside it and below."""
+    root = mjcf()
+    (tmp_path / "parts").mkdir()
+    base = root.find("worldbody/body")
+    leg = base.find("body")
+    for parent, node, name in (
+        (root, root.find("equality"), "loops.xml"),
+        (root, root.find("default"), "parts/classes.xml"),
+        (base, leg, "parts/leg.xml"),
+    ):
+        at = list(parent).index(node)
+        parent[at] = Element("include", file=name)
+        (tmp_path / name).write_bytes(b"<mujocoinclude>" + tostring(node) + b"</mujocoinclude>")
+    machine, _ = read(written(root, tmp_path), tmp_path)
+    assert_hexapod(machine, range(5, -1, -1))
+
+
 def test_an_sdf_of_another_origin(tmp_path):
     machine, _ = read(written(sdf(), tmp_path, "rig.world"), tmp_path)
     assert_hexapod(machine)
@@ -329,6 +381,21 @@ HOSTILE = {
 }
 
 
+NESTED = '<replicate count="100">' * 5 + "<body/>" + "</replicate>" * 5
+LONG_WORD = "x" * 100_000
+HOSTILE |= {
+    f"copies {k}": f"<mujoco><worldbody>{text}</worldbody></mujoco>"
+    for k, text in enumerate((
+        '<replicate count="1e300"><body/></replicate>',
+        '<replicate count="1.5"><body/></replicate>',
+        '<replicate count="nan"><body/></replicate>',
+        f'<replicate count="500" sep="{LONG_WORD}"><body name="a"/></replicate>',
+        f'<replicate count="500"><body name="{LONG_WORD}"/></replicate>',
+        NESTED,
+    ))
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("what", HOSTILE)
 def test_hostile_xml_is_refused(what, tmp_path):
     path = tmp_path / "model.xml"
@@ -336,6 +403,57 @@ def test_hostile_xml_is_refused(what, tmp_path):
     result = run("new", tmp_path / "mine", "--from", path)
     assert result.code == 2
     assert not (tmp_path / "mine").exists()
+
+
+INCLUDED = {
+    "part.xml": True, "below/part.xml": True, "./below/../part.xml": True, "inside.xml": True,
+    "../model.xml": False, "below/../../model.xml": False, "/etc/passwd": False,
+    "outside.xml": False, "out/model.xml": False, "loop.xml": False, "model.xml": False,
+    "circle.xml": False, "entities.xml": False, "pipe.xml": False, ".": False, "": False,
+    "nothing.xml": False, "a/" * 5000: False, "a" * 5000: False,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", INCLUDED)
+def test_files_are_included_from_beside_the_document_alone(name, tmp_path):
+    """Every file but the hostile ones is a whole hexapod, so that it is read where it may be."""
+    folder = tmp_path / "folder"
+    (folder / "below").mkdir(parents=True)
+    for path in (tmp_path / "model.xml", folder / "part.xml", folder / "below" / "part.xml"):
+        written(mjcf(), path.parent, path.name)
+    (folder / "entities.xml").write_text(ENTITIES)
+    (folder / "circle.xml").write_text('<a><include file="circle.xml"/></a>')
+    (folder / "inside.xml").symlink_to("part.xml")
+    (folder / "outside.xml").symlink_to(tmp_path / "model.xml")
+    (folder / "out").symlink_to(tmp_path)
+    (folder / "loop.xml").symlink_to("loop.xml")
+    os.mkfifo(folder / "pipe.xml")
+    (folder / "model.xml").write_text(f'<mujoco><include file="{name}"/></mujoco>')
+    result = run("new", tmp_path / "mine", "--from", folder / "model.xml")
+    assert (result.code == 0) == INCLUDED[name]
+    assert INCLUDED[name] or result.err.startswith("Error: model.xml")
+    assert (tmp_path / "mine").exists() == INCLUDED[name]
+
+
+def test_a_file_is_included_once(tmp_path):
+    (tmp_path / "part.xml").write_text("<a><size/></a>")
+    root = mjcf()
+    for name in ("part.xml", "./part.xml"):
+        root.append(Element("include", file=name))
+        path = written(root, tmp_path)
+        assert run("new", tmp_path / name[0], "--from", path).code == (0 if name[0] == "p" else 2)
+
+
+def test_a_xacro_is_refused_with_its_way_out(tmp_path):
+    path = tmp_path / "robot.urdf.xacro"
+    path.write_text(
+        '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+        '<xacro:property name="a" value="1"/><link name="base"/></robot>'
+    )
+    with pytest.raises(InputError) as refused:
+        pkmcal.new(from_file=path)
+    assert refused.value.where == path.name
+    assert "xacro" in refused.value.next_step
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def _read(path: Path, text: str) -> tuple[ReadModel, str]:
     """Model of a file, and its format."""
     root = xml_root(text)
     if root.tag == "mujoco":
-        return read_mujoco(text), FORMATS[root.tag]
+        return read_mujoco(text, path.parent), FORMATS[root.tag]
     if root.tag == "sdf":
         return read_sdf(text), FORMATS[root.tag]
     if root.tag != "robot":
@@ -98,6 +98,13 @@ def _read(path: Path, text: str) -> tuple[ReadModel, str]:
             "the file is no model of bodies and joints",
             found=label_of(root),
             expected="<mujoco>, <sdf> or <robot>",
+        )
+    if foreign := [node.tag for node in root.iter() if "}" in node.tag]:
+        raise InputError(
+            "a xacro file is not read",
+            found=foreign[0],
+            expected="the URDF that it expands to",
+            next_step="Expand it with xacro: xacro FILE > FILE.urdf",
         )
     beside = path.with_name(path.stem + LOOPS_ENDING)
     if not beside.is_file():

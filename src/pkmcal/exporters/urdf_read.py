@@ -69,10 +69,6 @@ def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadMode
     """
     root = xml_root(text)
     beside = validated_document(parse_yaml(loops, Path(loops_name)), LoopsDocument)
-    if foreign := [node for node in root.iter() if "}" in node.tag]:
-        raise InputError(
-            "a xacro file is not read", found=foreign[0].tag, expected="the URDF that it expands to"
-        )
     tree = _Tree(root, loops_name)
     couplings = _couplings(root, tree)
     # the state at home

@@ -36,6 +36,12 @@ def xml_root(text: str) -> Element:
         root = fromstring(text)
     except (ParseError, ValueError) as error:
         raise InputError("the file is not XML", found=str(error)) from None
+    check_size(root)
+    return root
+
+
+def check_size(root: Element) -> None:
+    """Raise InputError for a tree that is too large for a machine."""
     elements, level, layer = 0, 0, [root]
     while layer:
         elements, level = elements + len(layer), level + 1
@@ -53,7 +59,6 @@ def xml_root(text: str) -> Element:
             found=parts,
             expected=f"at most {MOST_PARTS}",
         )
-    return root
 
 
 def label_of(node: Element) -> str:
