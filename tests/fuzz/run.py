@@ -260,6 +260,8 @@ def _files_of(case: Case) -> set[str]:
         if path.parts[0] in ("legs", "hand", "tracker", "later", "board"):
             names |= {"session.yaml", "joints.csv", "images/", "mechanism.yaml", "cameras/"}
             names |= {"poses.csv", "board.yaml", "distances.csv"}
+        if path.parts[0] == "models":  # of a model in several files
+            names |= {"whole.xml", "robot.urdf"}
     return names
 
 

@@ -118,7 +118,11 @@ def _include(root: Element, folder: Path | None) -> None:
             if path in done:
                 raise refused(node, "the file is included twice", name)
             done.add(path)
-            inside = xml_root(read_text(Path(path), name, LARGEST_MODEL_FILE))
+            text = read_text(Path(path), name, LARGEST_MODEL_FILE)
+            try:
+                inside = xml_root(text)
+            except InputError as error:
+                raise error.as_input(name) from None
             at = list(parent).index(node)
             parent[at : at + 1] = list(inside)
         check_size(root)

@@ -63,7 +63,7 @@ class JointCentres(StarterSource):
             raise InputError(
                 "joint centres need the legs' length at home",
                 where="--from",
-                found="no --leg",
+                found=f"{path.name} without --leg",
                 expected="--leg LENGTH, and where known --travel and --tube-radius",
             )
         screws: tuple[Screw, ...] | None = None

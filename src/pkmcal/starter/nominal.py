@@ -14,6 +14,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import parse_yaml, validated_document
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+from pkmcal.wording import listed
 
 TOLERANCE_SHARE, LARGEST_TOLERANCE = 0.02, 0.002
 """Standard deviation of a centre relative to the longest leg, and its largest value, m: a ruler
@@ -170,6 +171,21 @@ class NominalModel:
         """The machine. Raises InputError for a text that is no machine."""
         document = parse_yaml(self.text(), Path("mechanism.yaml"))
         return checked_machine(validated_document(document, MechanismDocument), document)
+
+    def check_reach(self, where: str) -> None:
+        """Raise InputError for a model with legs that do not reach the platform at home.
+
+        where : of the message.
+        """
+        machine = self.machine()
+        readings = machine.inverse(machine.home()[None])[0]
+        if not np.isfinite(readings).all():
+            raise InputError(
+                "legs do not reach the platform at home",
+                where=where,
+                found=listed([str(k + 1) for k in np.flatnonzero(~np.isfinite(readings))]),
+                expected="lengths, arms or spools with which they do",
+            )
 
     def check_home(self, where: str, expected: str | None = None) -> None:
         """Raise InputError for a model whose platform could move at home with all motors at rest.
