@@ -28,6 +28,8 @@ from pkmcal.mechanisms import load_mechanism
 
 ROUNDING = 1e-12
 """m and rad; 1.2e-13 was the largest of all machines."""
+RADIUS_ROUNDING = 6e-7
+"""m, of the radii in a nominal model's file."""
 BASE = np.array(
     [[0.3 * np.cos(a), 0.3 * np.sin(a), 0.05] for a in np.deg2rad([-10, 10, 110, 130, 230, 250])]
 )
@@ -71,6 +73,8 @@ def test_what_is_exported_as_xml_is_read_as_the_same_machine(name, tmp_path):
         assert np.abs(away).max() < ROUNDING
         np.testing.assert_allclose(model.joint_ranges, machine.joint_ranges, atol=ROUNDING)
         assert "differ" not in text
+        for drawn, radii in zip(model.radii(), machine.radii(), strict=True):
+            np.testing.assert_allclose(sorted(drawn), sorted(radii), atol=RADIUS_ROUNDING)
     assert {"mujoco", "sdf", "urdf"} <= set(formats)
 
 
@@ -184,6 +188,41 @@ def test_an_mjcf_of_another_origin(tmp_path):
     assert all(leg.tubes[0].radius == 0.01 for leg in machine.document.legs)
     joints = [leg.base.joint for leg in machine.document.legs]
     assert joints == ["spherical"] + ["universal"] * 5
+
+
+@pytest.mark.parametrize("make", ["mjcf", "sdf"])
+def test_cylinders_along_the_legs_are_their_tubes(make, tmp_path):
+    """By ends, or by middle and length; others, and those beside a leg, are none."""
+    root = {"mjcf": mjcf, "sdf": sdf}[make]()
+    if make == "mjcf":
+        rods = root.findall("worldbody/body[@name='frame']/body")
+        for rod in rods[1:]:  # the origin is 0.1 m up the leg
+            SubElement(rod, "geom", type="capsule", size="0.008", fromto="0 0 -0.05 0 0 0.1")
+            SubElement(rod, "geom", type="cylinder", size="0.005 0.05", pos="0 0 0.14")
+            SubElement(rod, "geom", type="cylinder", size="0.02", fromto="0.01 0 0 0.01 0 0.1")
+            SubElement(rod, "geom", size="0.03")
+        places = [(0.008, 0.05, 0.2), (0.005, 0.19, 0.29)]
+    else:
+        for k, length in enumerate(LENGTHS):
+            visual = SubElement(root.find(f".//link[@name='shaft{k}']"), "visual", name="v")
+            SubElement(visual, "pose").text = f"0 0 {0.15 - length / 2} 0 0 0"
+            cylinder = SubElement(SubElement(visual, "geometry"), "cylinder")
+            SubElement(cylinder, "radius").text, SubElement(cylinder, "length").text = (
+                "0.008",
+                "0.2",
+            )
+        places = [(0.008, 0.05, 0.25)]
+    machine, text = read(written(root, tmp_path), tmp_path)
+    order = range(5, -1, -1) if make == "mjcf" else range(6)
+    for k, leg in zip(order, machine.document.legs, strict=True):
+        tubes = [(tube.radius, tube.start, tube.stop) for tube in leg.tubes]
+        assert len(tubes) == (0 if make == "mjcf" and k == 0 else len(places))
+        if tubes:
+            np.testing.assert_allclose(tubes, places, atol=2e-6)
+    assert "cylinders" in text
+    (tmp_path / "other").mkdir()
+    other, _ = read(written(root, tmp_path), tmp_path / "other", tube_radius=0.01)
+    assert {tube.radius for leg in other.document.legs for tube in leg.tubes} == {0.01}
 
 
 def test_mujoco_has_the_bodies_where_they_are_read():

@@ -39,6 +39,10 @@ rad."""
 EQUAL_SHARE = 1e-9
 """Difference above which the nominal model's comment states it."""
 COMPARED_POSES = 8
+DRAWN_TUBES = (
+    "The legs' tubes are the cylinders that the file draws along them, at home: measure their"
+    " radii."
+)
 LEAST_SCALE, MOST_SCALE = 0.5, 2.0
 """Bounds of the ratio of a joint's value and its reading; beyond them it is a gear of something
 else."""
@@ -166,6 +170,7 @@ def _nominal(model: ReadModel, form: str, path: Path, tube: float | None) -> Nom
         (
             f"The machine of {legible(path.name)}, {form}: base, platform and legs by its bodies"
             " and joints, in its frame, m and rad. The format has no ties between parameters.",
+            *((DRAWN_TUBES,) if tube is None and any(leg.tubes for leg in legs) else ()),
             *((f"Joints in no loop, held at home: {legible(listed(tool, 8))}.",) if tool else ()),
         ),
         (),

@@ -21,6 +21,7 @@ from pkmcal.exporters.read_model import (
     NO_LIMITS,
     ReadBody,
     ReadCoupling,
+    ReadCylinder,
     ReadJoint,
     ReadLoop,
     ReadModel,
@@ -29,7 +30,6 @@ from pkmcal.exporters.read_model import (
 from pkmcal.exporters.xml_read import (
     LARGEST_MODEL_FILE,
     MOST_ELEMENTS,
-    TUBE_MARK,
     attribute,
     check_size,
     refused,
@@ -90,7 +90,7 @@ def read_mujoco(text: str, folder: Path | None = None) -> ReadModel:
         tuple(_loop(n, at, tree.sites) for n in nodes if n.tag in ("connect", "weld")),
         tuple(_coupling(n, joints) for n in nodes if n.tag == "joint"),
         tree.sites,
-        tree.radii,
+        tuple(tree.cylinders),
         np.array([joints[n.attrib["joint"]].dof for n in drives], dtype=int),
         # of other actuators the gear scales a force, not a value
         np.array([vector(n, "gear", "1", *range(1, 7))[0] if n.tag == "position" else 1.0
@@ -244,7 +244,7 @@ class _Bodies:
     units: tuple[float, str]
     bodies: list[ReadBody] = field(default_factory=lambda: [ReadBody("world", 0, np.eye(4), ())])
     sites: dict[str, tuple[int, Array]] = field(default_factory=dict[str, tuple[int, Array]])
-    radii: dict[str, float] = field(default_factory=dict[str, float])
+    cylinders: list[ReadCylinder] = field(default_factory=list[ReadCylinder])
     dofs: int = 0
     has_ball: bool = False
 
@@ -254,9 +254,13 @@ class _Bodies:
             if "name" in site.attrib:
                 point = apply(frame, vector(site, "pos", "0 0 0"))
                 self.sites[site.attrib["name"]] = (number, point)
-        for geom in node.findall("geom"):
-            if TUBE_MARK in geom.get("name", ""):
-                self.radii[geom.attrib["name"]] = float(vector(geom, "size", "", 1, 2, 3)[0])
+        self.cylinders += [
+            self._cylinder(geom, number, frame)
+            for geom in node.findall("geom")
+            if geom.get("type") in ("cylinder", "capsule")
+            and "size" in geom.attrib
+            and not set(UNREAD_ORIENTATIONS) & set(geom.attrib)
+        ]
         for child in node:
             if child.tag in FRAMES:
                 if (joint := child.find("joint")) is not None:
@@ -266,6 +270,17 @@ class _Bodies:
                 name = child.get("name", f"body {len(self.bodies)}")
                 self._add(child, name, number, frame)
                 self.collect(child, len(self.bodies) - 1)
+
+    def _cylinder(self, node: Element, number: int, frame: Array) -> ReadCylinder:
+        """Cylinder or capsule of a body, by its ends or by its middle and half its length."""
+        if "fromto" in node.attrib:
+            radius, ends = vector(node, "size", "", 1, 2, 3)[0], vector(node, "fromto", "", 6)
+            ends = ends.reshape(2, 3)
+        else:
+            radius, half, *_ = vector(node, "size", "", 2, 3)
+            place = pose(self._turn(node), vector(node, "pos", "0 0 0"))
+            ends = apply(place, np.array([[0, 0, -half], [0, 0, half]]))
+        return ReadCylinder(node.get("name", ""), number, apply(frame, ends), float(radius))
 
     def _frame(self, node: Element) -> Array:
         """Pose (4, 4) of a frame; of a copy, that of as many steps as its number."""

@@ -17,8 +17,6 @@ MOST_PARTS, PART_TAGS = 600, frozenset({"body", "link", "joint", "connect", "wel
 """Most bodies and joints of a machine, and the elements that are one."""
 LARGEST_MODEL_FILE = 2**22
 """Largest file of a model, bytes."""
-TUBE_MARK = "_tube"
-"""Part of the names of the cylinders that are a leg's; other shapes are not read."""
 LARGEST_LIMIT = 1e3
 """Joint limit, m or rad, above which it stands for none."""
 

@@ -50,7 +50,8 @@ class NominalLeg:
     base, rod : their entries in the file. start : A (3,) at home, base frame. platform : B (3,),
     platform frame. least : shortest length; None for that at home. axis : (3,) of its universal
     joint on the platform; None for a spherical one. held : the platform's entry, where it is
-    neither of these. scale : of the reading; 1 if empty.
+    neither of these. scale : of the reading; 1 if empty. tubes : radius, start and end of
+    cylinders, m from A.
     """
 
     base: str
@@ -61,6 +62,7 @@ class NominalLeg:
     axis: Array | None = None
     held: str = ""
     scale: str = ""
+    tubes: tuple[tuple[float, float, float], ...] = ()
 
     __repr__ = short_repr
 
@@ -211,14 +213,16 @@ class NominalModel:
         platform = leg.held or _joint(leg.platform, leg.axis)
         text = f"  - base: {leg.base}\n    platform: {platform}\n    length: {leg.rod}\n"
         text += f"    scale: {leg.scale}\n" if leg.scale else ""
-        if self.tube_radius is None:
-            return text
-        length = float(np.linalg.norm(leg.platform + self.home - leg.start))
-        start, stop = ((leg.least or length) * share for share in TUBE_PART)
-        return text + (
-            f"    tubes: [{{radius: {millimetres(self.tube_radius)}, from: {millimetres(start)},"
-            f" to: {millimetres(stop)}}}]\n"
-        )
+        tubes = leg.tubes
+        if self.tube_radius is not None:
+            length = float(np.linalg.norm(leg.platform + self.home - leg.start))
+            start, stop = ((leg.least or length) * share for share in TUBE_PART)
+            tubes = ((self.tube_radius, start, stop),)
+        entries = [
+            f"{{radius: {radius}, from: {start}, to: {stop}}}"
+            for radius, start, stop in (map(millimetres, tube) for tube in tubes)
+        ]
+        return f"{text}    tubes: [{', '.join(entries)}]\n" if tubes else text
 
 
 def _numbers(values: Array | tuple[float, ...]) -> str:
