@@ -259,7 +259,7 @@ def test_incomplete_pins_are_refused(old, new, where, hexapod, tmp_path):
         ("base_x [mm]", "base_x [deg]", "h.csv, line 1"),
         ("\n1,", "\n1,,", "h.csv, line 2"),
         ("\n1,1", "\n1,x1", "h.csv, line 2, base_x"),
-        (" [mm]", "", "h.csv"),
+        (" [mm]", "", "h.csv, leg 1, base_x"),
     ],
 )
 def test_wrong_tables_are_refused(old, new, where, hexapod, tmp_path):

@@ -346,6 +346,7 @@ REFUSED = {
     "a tendon": (lambda: changed(mjcf, "actuator/motor", joint=None, tendon="rope"), "rope"),
     "no such class": (lambda: changed(mjcf, ".//joint[@name='slide0']", **{"class": "x"}), "x"),
     "no number": (lambda: changed(mjcf, ".//site", pos="0 zero 0"), "zero"),
+    "too large": (lambda: changed(mjcf, ".//site", pos="0 1e200 0"), "1e200"),
     "not finite": (lambda: changed(mjcf, ".//site", pos="0 nan 0"), "nan"),
     "no direction": (lambda: changed(mjcf, ".//joint[@name='slide0']", axis="0 0 0"), "0.0"),
     "no such site": (lambda: changed(mjcf, "equality/connect", site2="nowhere"), "nowhere"),
