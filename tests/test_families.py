@@ -16,7 +16,7 @@ NUMBERS = {
     "hexapod": {"base_radius": 0.18, "platform_radius": 0.12, "leg": 0.3, "travel": 0.1},
     "rotary-hexapod": {
         "base_radius": 0.18, "platform_radius": 0.12, "arm": 0.04, "leg": 0.2,
-        "base_spacing": 0.08, "platform_spacing": 0.04,
+        "base_spacing": 0.08, "platform_spacing": 0.04, "arm_angle": 1.2,
     },
     "delta": {"base_radius": 0.085, "platform_radius": 0.035, "arm": 0.1, "leg": 0.22},
     "linear-delta": {"base_radius": 0.14, "platform_radius": 0.035, "leg": 0.27, "travel": 0.3},
@@ -35,7 +35,10 @@ def folder(family, tmp_path):
     words = [
         word
         for name, value in (NUMBERS[family] | {"tube_radius": TUBE}).items()
-        for word in (f"--{name.replace('_', '-')}", f"{1e3 * value:g} mm")
+        for word in (
+            f"--{name.replace('_', '-')}",
+            f"{value:g} rad" if name == "arm_angle" else f"{1e3 * value:g} mm",
+        )
     ]
     assert run("new", tmp_path / "mine", "--machine", family, *words).code == 0
     return tmp_path / "mine"
@@ -86,8 +89,12 @@ def test_a_new_session_of_a_family_lacks_its_images_alone(folder):
     assert run("show", folder / "mechanism.yaml", "-o", folder / "page.html").code == 0
 
 
-def test_servos_of_a_pair_are_mirrored():
-    machine = machine_of("rotary-hexapod")
+@pytest.mark.parametrize(
+    ("degrees", "apart"), [(90, 0.08 + 2 * 0.04), (-90, 0.0), (0, 0.08), (-150, 0.08 - 0.04)]
+)
+def test_servos_of_a_pair_are_mirrored(degrees, apart):
+    """apart : distance of the ends of a pair's level arms."""
+    machine = machine_of("rotary-hexapod", arm_angle=np.deg2rad(degrees))
     half = np.diag([1.0, -1.0, 1.0])  # across the plane y = 0, in which the first pair is
     still, risen = (
         machine.ends_at(np.full(6, angle), machine.home()).a for angle in (0.0, np.deg2rad(30))
@@ -95,9 +102,9 @@ def test_servos_of_a_pair_are_mirrored():
     np.testing.assert_allclose(still[0], half @ still[1], atol=1e-9)
     np.testing.assert_allclose(risen[0], half @ risen[1], atol=1e-9)
     np.testing.assert_allclose(risen[:, 2], 0.04 * np.sin(np.deg2rad(30)), atol=1e-9)
-    assert np.linalg.norm(still[0] - still[1]) == pytest.approx(0.08 + 2 * 0.04, abs=3e-6)
-    turned = machine.base_axes()[::2] @ machine.base_axes()[1::2].T
-    np.testing.assert_allclose(np.diag(turned), -1, atol=1e-9)
+    assert np.linalg.norm(still[0] - still[1]) == pytest.approx(apart, abs=3e-6)
+    outwards = [still[j, 0] - machine.document.legs[j].base.center[0] for j in (0, 1)]
+    np.testing.assert_allclose(outwards, 0.04 * np.cos(np.deg2rad(degrees)), atol=2e-6)
 
 
 def machine_of(family, **changed):
@@ -111,6 +118,9 @@ def test_numbers_that_were_not_given_are_named():
     assert options == ["--base-spacing", "--platform-spacing"]
     result = pkmcal.new("rotary-hexapod", **NUMBERS["rotary-hexapod"])
     assert result.outcome.findings == ()
+    numbers = {key: value for key, value in NUMBERS["rotary-hexapod"].items() if key != "arm_angle"}
+    (assumed,) = pkmcal.new("rotary-hexapod", **numbers).outcome.findings
+    assert assumed.facts["option"] == "--arm-angle"
 
 
 @pytest.mark.parametrize(
@@ -127,6 +137,8 @@ def test_numbers_that_were_not_given_are_named():
         ("hexapod", {"base_spacing": 0.32}, "--base-spacing"),
         ("hexapod", {"travel": 0.6}, "--travel"),
         ("hexapod", {"arm": 0.1}, "--arm"),
+        ("hexapod", {"arm_angle": 1.0}, "--arm-angle"),
+        ("rotary-hexapod", {"arm_angle": 90.0}, "arm_angle"),
         ("delta", {"travel": 0.1}, "--travel"),
         ("hexapod", {"tube_radius": 0.2}, "--tube-radius"),
         # regular hexagons: a singular architecture
@@ -145,7 +157,12 @@ def test_impossible_numbers_are_refused(name, changed, where):
 
 @pytest.mark.parametrize("name", NUMBERS)
 def test_a_family_needs_its_numbers(name):
-    for number in NUMBERS[name].keys() - {"travel", "base_spacing", "platform_spacing"}:
+    for number in NUMBERS[name].keys() - {
+        "travel",
+        "base_spacing",
+        "platform_spacing",
+        "arm_angle",
+    }:
         less = {key: value for key, value in NUMBERS[name].items() if key != number}
         with pytest.raises(InputError) as refused:
             pkmcal.new(name, **less)
@@ -242,7 +259,7 @@ def test_incomplete_pins_are_refused(old, new, where, hexapod, tmp_path):
         ("base_x [mm]", "base_x [deg]", "h.csv, line 1"),
         ("\n1,", "\n1,,", "h.csv, line 2"),
         ("\n1,1", "\n1,x1", "h.csv, line 2, base_x"),
-        (" [mm]", "", "h.csv"),
+        (" [mm]", "", "h.csv, leg 1, base_x"),
     ],
 )
 def test_wrong_tables_are_refused(old, new, where, hexapod, tmp_path):

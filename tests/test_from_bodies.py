@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
 
 import numpy as np
@@ -27,6 +28,8 @@ from pkmcal.mechanisms import load_mechanism
 
 ROUNDING = 1e-12
 """m and rad; 1.2e-13 was the largest of all machines."""
+RADIUS_ROUNDING = 6e-7
+"""m, of the radii in a nominal model's file."""
 BASE = np.array(
     [[0.3 * np.cos(a), 0.3 * np.sin(a), 0.05] for a in np.deg2rad([-10, 10, 110, 130, 230, 250])]
 )
@@ -70,6 +73,8 @@ def test_what_is_exported_as_xml_is_read_as_the_same_machine(name, tmp_path):
         assert np.abs(away).max() < ROUNDING
         np.testing.assert_allclose(model.joint_ranges, machine.joint_ranges, atol=ROUNDING)
         assert "differ" not in text
+        for drawn, radii in zip(model.radii(), machine.radii(), strict=True):
+            np.testing.assert_allclose(sorted(drawn), sorted(radii), atol=RADIUS_ROUNDING)
     assert {"mujoco", "sdf", "urdf"} <= set(formats)
 
 
@@ -185,6 +190,41 @@ def test_an_mjcf_of_another_origin(tmp_path):
     assert joints == ["spherical"] + ["universal"] * 5
 
 
+@pytest.mark.parametrize("make", ["mjcf", "sdf"])
+def test_cylinders_along_the_legs_are_their_tubes(make, tmp_path):
+    """By ends, or by middle and length; others, and those beside a leg, are none."""
+    root = {"mjcf": mjcf, "sdf": sdf}[make]()
+    if make == "mjcf":
+        rods = root.findall("worldbody/body[@name='frame']/body")
+        for rod in rods[1:]:  # the origin is 0.1 m up the leg
+            SubElement(rod, "geom", type="capsule", size="0.008", fromto="0 0 -0.05 0 0 0.1")
+            SubElement(rod, "geom", type="cylinder", size="0.005 0.05", pos="0 0 0.14")
+            SubElement(rod, "geom", type="cylinder", size="0.02", fromto="0.01 0 0 0.01 0 0.1")
+            SubElement(rod, "geom", size="0.03")
+        places = [(0.008, 0.05, 0.2), (0.005, 0.19, 0.29)]
+    else:
+        for k, length in enumerate(LENGTHS):
+            visual = SubElement(root.find(f".//link[@name='shaft{k}']"), "visual", name="v")
+            SubElement(visual, "pose").text = f"0 0 {0.15 - length / 2} 0 0 0"
+            cylinder = SubElement(SubElement(visual, "geometry"), "cylinder")
+            SubElement(cylinder, "radius").text, SubElement(cylinder, "length").text = (
+                "0.008",
+                "0.2",
+            )
+        places = [(0.008, 0.05, 0.25)]
+    machine, text = read(written(root, tmp_path), tmp_path)
+    order = range(5, -1, -1) if make == "mjcf" else range(6)
+    for k, leg in zip(order, machine.document.legs, strict=True):
+        tubes = [(tube.radius, tube.start, tube.stop) for tube in leg.tubes]
+        assert len(tubes) == (0 if make == "mjcf" and k == 0 else len(places))
+        if tubes:
+            np.testing.assert_allclose(tubes, places, atol=2e-6)
+    assert "cylinders" in text
+    (tmp_path / "other").mkdir()
+    other, _ = read(written(root, tmp_path), tmp_path / "other", tube_radius=0.01)
+    assert {tube.radius for leg in other.document.legs for tube in leg.tubes} == {0.01}
+
+
 def test_mujoco_has_the_bodies_where_they_are_read():
     """At values of all hinges and slides; MuJoCo's order is that of the state."""
     mujoco = pytest.importorskip("mujoco", reason=LOUD)
@@ -209,6 +249,57 @@ def test_mujoco_has_the_bodies_where_they_are_read():
     for k, name in compared:
         place = pose(data.xmat[k].reshape(3, 3), data.xpos[k])
         np.testing.assert_allclose(places[name], place, atol=1e-12)
+
+
+REPLICATED = """<mujoco><compiler eulerseq="zyx" angle="{angle}"/><worldbody>
+  <body name="plate" pos="0 0 1"><freejoint/><geom size=".1"/>
+    <replicate count="3" euler="{turn} 0 0"><site name="socket" pos=".1 0 0"/></replicate></body>
+  <frame name="f" pos="0 1 2" euler="{turn} 0 0"><replicate count="10" sep="-" offset="1 0 .2"
+    euler=".3 .2 0"><body name="far" pos=".1 0 0"><joint name="j" axis="0 1 0"/><geom size=".1"/>
+    <site name="tip" pos="0 0 1"/></body></replicate></frame>
+  <replicate count="3" euler="{turn} 0 0"><body name="leg" pos=".2 0 0"><joint name="hip"
+    axis="0 1 0"/><geom size=".1"/><replicate count="2" offset="0 .1 0"><body name="toe">
+    <joint name="knee"/><geom size=".1"/></body></replicate></body></replicate>
+</worldbody><equality><connect body1="leg" anchor="0 0 1"/><joint joint1="knee1" joint2="hip"/>
+</equality><actuator><position name="motor" joint="hip"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("angle", "turn"), [("degree", "120"), ("radian", "2")])
+def test_mujoco_has_the_copies_where_they_are_read(angle, turn):
+    mujoco = pytest.importorskip("mujoco", reason=LOUD)
+    text = REPLICATED.format(angle=angle, turn=turn)
+    theirs, model = mujoco.MjModel.from_xml_string(text), read_mujoco(text)
+    data = mujoco.MjData(theirs)
+    mujoco.mj_kinematics(theirs, data)
+    places, sites = model.places(model.key), model.site_places(model.key)
+    assert len(places) == theirs.nbody == 21
+    for k in range(theirs.nbody):
+        place = pose(data.xmat[k].reshape(3, 3), data.xpos[k])
+        np.testing.assert_allclose(places[theirs.body(k).name], place, atol=1e-12)
+    assert len(sites) == theirs.nsite
+    for k in range(theirs.nsite):
+        np.testing.assert_allclose(sites[theirs.site(k).name], data.site_xpos[k], atol=1e-12)
+    assert len(model.loops) + len(model.couplings) == theirs.neq
+    dofs = [theirs.jnt_dofadr[k] for k in theirs.actuator_trnid[:, 0]]
+    np.testing.assert_array_equal(model.actuated, dofs)
+
+
+def test_an_mjcf_in_several_files(tmp_path):
+    """Default classes, constraints and a leg are in files beside it and below."""
+    root = mjcf()
+    (tmp_path / "parts").mkdir()
+    base = root.find("worldbody/body")
+    leg = base.find("body")
+    for parent, node, name in (
+        (root, root.find("equality"), "loops.xml"),
+        (root, root.find("default"), "parts/classes.xml"),
+        (base, leg, "parts/leg.xml"),
+    ):
+        at = list(parent).index(node)
+        parent[at] = Element("include", file=name)
+        (tmp_path / name).write_bytes(b"<mujocoinclude>" + tostring(node) + b"</mujocoinclude>")
+    machine, _ = read(written(root, tmp_path), tmp_path)
+    assert_hexapod(machine, range(5, -1, -1))
 
 
 def test_an_sdf_of_another_origin(tmp_path):
@@ -255,6 +346,7 @@ REFUSED = {
     "a tendon": (lambda: changed(mjcf, "actuator/motor", joint=None, tendon="rope"), "rope"),
     "no such class": (lambda: changed(mjcf, ".//joint[@name='slide0']", **{"class": "x"}), "x"),
     "no number": (lambda: changed(mjcf, ".//site", pos="0 zero 0"), "zero"),
+    "too large": (lambda: changed(mjcf, ".//site", pos="0 1e200 0"), "1e200"),
     "not finite": (lambda: changed(mjcf, ".//site", pos="0 nan 0"), "nan"),
     "no direction": (lambda: changed(mjcf, ".//joint[@name='slide0']", axis="0 0 0"), "0.0"),
     "no such site": (lambda: changed(mjcf, "equality/connect", site2="nowhere"), "nowhere"),
@@ -329,6 +421,21 @@ HOSTILE = {
 }
 
 
+NESTED = '<replicate count="100">' * 5 + "<body/>" + "</replicate>" * 5
+LONG_WORD = "x" * 100_000
+HOSTILE |= {
+    f"copies {k}": f"<mujoco><worldbody>{text}</worldbody></mujoco>"
+    for k, text in enumerate((
+        '<replicate count="1e300"><body/></replicate>',
+        '<replicate count="1.5"><body/></replicate>',
+        '<replicate count="nan"><body/></replicate>',
+        f'<replicate count="500" sep="{LONG_WORD}"><body name="a"/></replicate>',
+        f'<replicate count="500"><body name="{LONG_WORD}"/></replicate>',
+        NESTED,
+    ))
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("what", HOSTILE)
 def test_hostile_xml_is_refused(what, tmp_path):
     path = tmp_path / "model.xml"
@@ -336,6 +443,57 @@ def test_hostile_xml_is_refused(what, tmp_path):
     result = run("new", tmp_path / "mine", "--from", path)
     assert result.code == 2
     assert not (tmp_path / "mine").exists()
+
+
+INCLUDED = {
+    "part.xml": True, "below/part.xml": True, "./below/../part.xml": True, "inside.xml": True,
+    "../model.xml": False, "below/../../model.xml": False, "/etc/passwd": False,
+    "outside.xml": False, "out/model.xml": False, "loop.xml": False, "model.xml": False,
+    "circle.xml": False, "entities.xml": False, "pipe.xml": False, ".": False, "": False,
+    "nothing.xml": False, "a/" * 5000: False, "a" * 5000: False,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", INCLUDED)
+def test_files_are_included_from_beside_the_document_alone(name, tmp_path):
+    """Every file but the hostile ones is a whole hexapod, so that it is read where it may be."""
+    folder = tmp_path / "folder"
+    (folder / "below").mkdir(parents=True)
+    for path in (tmp_path / "model.xml", folder / "part.xml", folder / "below" / "part.xml"):
+        written(mjcf(), path.parent, path.name)
+    (folder / "entities.xml").write_text(ENTITIES)
+    (folder / "circle.xml").write_text('<a><include file="circle.xml"/></a>')
+    (folder / "inside.xml").symlink_to("part.xml")
+    (folder / "outside.xml").symlink_to(tmp_path / "model.xml")
+    (folder / "out").symlink_to(tmp_path)
+    (folder / "loop.xml").symlink_to("loop.xml")
+    os.mkfifo(folder / "pipe.xml")
+    (folder / "model.xml").write_text(f'<mujoco><include file="{name}"/></mujoco>')
+    result = run("new", tmp_path / "mine", "--from", folder / "model.xml")
+    assert (result.code == 0) == INCLUDED[name]
+    assert INCLUDED[name] or result.err.startswith("Error: model.xml")
+    assert (tmp_path / "mine").exists() == INCLUDED[name]
+
+
+def test_a_file_is_included_once(tmp_path):
+    (tmp_path / "part.xml").write_text("<a><size/></a>")
+    root = mjcf()
+    for name in ("part.xml", "./part.xml"):
+        root.append(Element("include", file=name))
+        path = written(root, tmp_path)
+        assert run("new", tmp_path / name[0], "--from", path).code == (0 if name[0] == "p" else 2)
+
+
+def test_a_xacro_is_refused_with_its_way_out(tmp_path):
+    path = tmp_path / "robot.urdf.xacro"
+    path.write_text(
+        '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+        '<xacro:property name="a" value="1"/><link name="base"/></robot>'
+    )
+    with pytest.raises(InputError) as refused:
+        pkmcal.new(from_file=path)
+    assert refused.value.where == path.name
+    assert "xacro" in refused.value.next_step
 
 
 @pytest.mark.parametrize(

@@ -54,3 +54,18 @@ def test_a_whole_session_takes_nothing_besides(given, tmp_path):
     with pytest.raises(InputError) as refused:
         pkmcal.new(from_file=tmp_path / "log.txt", **given)
     assert refused.value.where == "--from"
+
+
+def test_a_machine_that_does_not_reach_home_is_refused(tmp_path):
+    """The second spool is too small for the line that it would have to take."""
+    anchors = "M669 K6 A0:-1600:-120 B1390:800:-120 C-1390:800:-120 D0:0:2300\n"
+    path = tmp_path / "config.g"
+    for radius, reaches in ((30, True), (3, False)):
+        spools = f"M666 Q0.05 R30:{radius}:30:30 U2:2:2:2 O1:1:1:1 L20:20:20:20 H255:255:255:255"
+        path.write_text(f"{anchors}{spools}\n")
+        if reaches:
+            assert "mechanism.yaml" in pkmcal.new(from_file=path).texts
+            continue
+        with pytest.raises(InputError) as refused:
+            pkmcal.new(from_file=path)
+        assert (refused.value.where, refused.value.found) == ("config.g", "2")

@@ -345,6 +345,27 @@ def test_the_machine_is_found_from_nowhere(page, truth):
     assert off(value["overlay"]["pose"], truth.T_camera_base[0])[0] < 1.0
 
 
+@pytest.mark.parametrize("away", [0.0, 80.0])
+def test_a_fit_moves_no_joint_away_from_where_it_was_placed(page, truth, away):
+    """Both pins are moved by ``away`` px, so the machine is placed beside where it is."""
+    true = truth.T_camera_base[0].tolist()
+    joints = page.ask("overlay", pose=true)["joints"][:4:3]
+    pins = [
+        {
+            "image": 0,
+            "leg": one["leg"],
+            "end": one["end"],
+            "pixel": [one["at"][0] + away, one["at"][1]],
+        }
+        for one in joints
+    ]
+    value = page.ask("localize", pose=true, pins=pins)
+    assert value["localized"] == (away == 0)
+    placed = page.ask("overlay", pose=true, pins=pins)["pose"]
+    angle, distance = off(value["overlay"]["pose"], np.array(placed))
+    assert (angle < 1e-9 and distance < 1e-9) == (away > 0)
+
+
 def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
     loaded = load_session(session)
     rng = np.random.default_rng(3)

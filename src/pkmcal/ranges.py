@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import pi
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Any, Literal
@@ -72,6 +73,7 @@ FAMILY_DIMENSIONS = (
     "arm",
     "base_spacing",
     "platform_spacing",
+    "arm_angle",
     "travel",
     "tube_radius",
 )
@@ -84,7 +86,11 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
         "calibrate": {"seed": _SEED, "holdout": _whole(0, 100_000, 0)},
         "camera": {"distance": Range(0, 1000, above=True, unit="m")},
         "check": {"seed": _SEED},
-        "new": {"places": _whole(1, 20), **dict.fromkeys(FAMILY_DIMENSIONS, _DIMENSION)},
+        "new": {
+            "places": _whole(1, 20),
+            **dict.fromkeys(FAMILY_DIMENSIONS, _DIMENSION),
+            "arm_angle": Range(-pi, pi, unit="rad"),
+        },
         "plan": {
             "configurations": _whole(2, MOST_PLANNED_CONFIGURATIONS, 15),
             "places": _whole(1, 12),

@@ -13,12 +13,14 @@ import numpy as np
 
 import printers
 from fuzz import pictures
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.camera_calibration.calibrate import CalibrationCheckOptions, calibrate_camera
 from pkmcal.camera_calibration.model_selection import ModelSelectionOptions
 from pkmcal.cameras import load_camera
 from pkmcal.cameras.files import CAMERA_FILE_FORMATS, foreign_text
 from pkmcal.commands.cli import main
 from pkmcal.errors import InputError
+from pkmcal.exporters.contract import exporters
 from pkmcal.files import Exif, csv_text, with_exif, yaml_text
 from pkmcal.geometry.rigid import look_at, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
@@ -75,6 +77,7 @@ def make(folder: Path) -> None:
         (folder / "machines" / f"{name}.yaml").write_text(text)
     cameras(folder / "cameras")
     delta_printers(folder / "printers")
+    models(folder / "models")
     pictures_of(folder / "pictures", (folder / "legs/images/station1/0000.png").read_bytes())
     results(folder)
 
@@ -146,6 +149,55 @@ def delta_printers(folder: Path) -> None:
     )
     heads, points = ("x [mm]", "y [mm]", "z [mm]"), np.pad(places, ((0, 0), (0, 1)))
     (folder / "points.csv").write_text(csv_text(heads, [*"abcdefgh"], points))
+
+
+COPIED_LEG = """<body name="rod{s}" pos="0.2 {y} 0"><joint name="ball{s}" type="ball"/>
+<body name="piston{s}"><joint name="slide{s}" type="slide" axis="-0.15 {u} 0.3"/>
+<site name="tip{s}" pos="-0.15 {u} 0.3"/></body></body>"""
+SIDES = {"l": (0.05, 0.04), "r": (-0.05, -0.04)}
+COPIES = (
+    '<mujoco><worldbody><body name="platform" pos="0 0 0.3"><freejoint/><replicate count="3"'
+    ' euler="0 0 120"><site name="topl" pos="0.05 0.09 0"/><site name="topr" pos="0.05 -0.09 0"/>'
+    '</replicate></body><replicate count="3" euler="0 0 120" sep="-"><frame>'
+    + "".join(COPIED_LEG.format(s=s, y=y, u=u) for s, (y, u) in SIDES.items())
+    + "</frame></replicate></worldbody><equality>"
+    + "".join(f'<connect site1="tip{s}-{k}" site2="top{s}{k}"/>' for s in SIDES for k in range(3))
+    + "</equality><actuator>"
+    + "".join(f'<motor joint="slide{s}"/>' for s in SIDES)
+    + "</actuator></mujoco>\n"
+)
+"""Hexapod of copied legs."""
+
+
+def models(folder: Path) -> None:
+    """Files of ``new --from``: a machine in three formats and in two files, and joint centres."""
+    folder.mkdir()
+    for to in ("mujoco", "sdf", "urdf"):
+        for name, text in exporters()[to].files(MachineSource(load_mechanism("3-rpr"))).items():
+            if (folder / name).suffix in (".xml", ".sdf", ".urdf", ".yaml"):
+                ending = name.partition(".")[2]
+                (folder / f"robot.{ending}").write_text(text)
+    (folder / "copies.xml").write_text(COPIES)
+    (folder / "whole.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+    (folder / "part.xml").write_text((folder / "robot.xml").read_text())
+    machine = load_mechanism("gough-stewart")
+    centers = {"base": machine.base_centers(), "platform": machine.platform_centers()}
+    (folder / "pins.hal").write_text("".join(
+        f"setp genhexkins.{end}.{j}.{axis} {1e3 * x:.4f}\n"
+        for end, points in centers.items() for j, point in enumerate(points)
+        for axis, x in zip("xyz", point, strict=True)
+    ))  # fmt: skip
+    heads = [f"{end}_{axis} [mm]" for end in centers for axis in "xyz"]
+    rows = 1e3 * np.hstack(list(centers.values()))
+    table = csv_text(heads, [str(k) for k in range(1, 7)], rows)
+    (folder / "centres.csv").write_text(table.replace("configuration", "leg", 1))
+    (folder / "hangprinter.g").write_text(
+        "M669 K6 A0:-1600:-120 B1390:800:-120 C-1390:800:-120 D0:0:2300\nM666 Q0.05 R30:30:30:30"
+        " U2:2:2:2 O1:1:1:1 L20:20:20:20 H255:255:255:255\n"
+    )
+    positions = ", ".join(f"{{bl:{2900 + 7 * k}, br:{3100 - 3 * k}, tr:{3000 + k},"
+                          f" tl:{3050 - k}}}" for k in range(6))  # fmt: skip
+    (folder / "maslow.log").write_text(f"CLBM:[{positions}]\n")
 
 
 EVERYTHING = """\

@@ -10,6 +10,7 @@ from pathlib import Path
 from random import Random
 
 from fuzz import trees
+from fuzz.markup import SUFFIXES, spoil_xml
 from fuzz.pictures import spoil_picture
 from fuzz.texts import spoil_bytes, spoil_table
 
@@ -57,6 +58,7 @@ PRINTERS = tuple(
     f"printers/{n}" for n in ("printer.cfg", "config.g", "m503.txt", "configuration.txt")
 )
 POINTS = tuple(f"printers/{n}" for n in ("console.txt", "bed.g", "heightmap.txt", "points.csv"))
+MODELS = tuple(f"models/{n}" for n in ("robot.xml", "robot.sdf", "robot.urdf", "copies.xml"))
 RESULT = ("calibration/calibration.json",)
 TASKS = (
     Task("calibrate legs -o OUT", LEGS, "calibration", 6),
@@ -103,6 +105,12 @@ TASKS = (
     Task("new OUT --printer printers/printer.cfg --probed FILE", ("printers/part.log",), "", 2),
     Task("new OUT --printer printers/m503.txt --probed FILE", ("printers/grid.txt",), "", 1),
     Task("new OUT --from FILE", ("printers/rotary.cfg", "printers/winch.cfg"), "", 2),
+    Task("new OUT --from FILE", MODELS, "", 6),
+    Task("new OUT --from models/robot.urdf", ("models/robot.loops.yaml",), "", 1),
+    Task("new OUT --from models/whole.xml", ("models/part.xml",), "", 1),
+    Task("new OUT --from FILE --leg 0.3", ("models/centres.csv",), "", 1),
+    Task("new OUT --from FILE --leg 0.3 --unit mm", ("models/pins.hal",), "", 1),
+    Task("new OUT --from FILE", ("models/hangprinter.g", "models/maslow.log"), "", 1),
     Task("look-at legs", LEGS, "", 2),
     Task("look-at board", BOARD, "", 1),
     Task("look-at hand", HAND, "", 1),
@@ -110,7 +118,7 @@ TASKS = (
 """Most often those that are quick, where most malformed files are refused."""
 FORMATS = ("c", "json", "mujoco", "yaml")
 """Commands that take every machine."""
-ALONE = ("machines/", "cameras/", "printers/")
+ALONE = ("machines/", "cameras/", "printers/", "models/")
 """Bases of which a task takes one file only."""
 
 
@@ -215,6 +223,9 @@ def spoil(
         tree = trees.read_tree(path)
         how, values = trees.spoil_tree(tree, rng, path.suffix)
         new = trees.written(tree, path.suffix).encode("utf-8", "surrogatepass")
+    elif path.suffix in SUFFIXES and fresh and rng.random() < 0.75:
+        how, text = spoil_xml(data.decode(), rng)
+        new = text.encode("utf-8", "surrogatepass")
     else:
         how, new = _spoil_npz(data, rng) if path.suffix == ".npz" else spoil_bytes(data, rng)
     # The bases are linked, not copied.

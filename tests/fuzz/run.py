@@ -200,7 +200,8 @@ def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
         text = " ".join(errors)
         # another file that a spoilt session names, such as /etc/passwd, is a file as well
         has_file = any(name in text for name in _files_of(case)) or bool(ELSEWHERE.search(text))
-        places = [words for _, _, words in case.spoilt]
+        # loops that are exchanged fit the file, and show in the machine alone
+        places = [() if file.endswith(".loops.yaml") else words for file, _, words in case.spoilt]
         if len(places) == 1 and places[0] and "mine.txt" not in text:
             phrases = text.lower()
             has_field = bool(PLACE.search(text)) or any(
@@ -260,6 +261,8 @@ def _files_of(case: Case) -> set[str]:
         if path.parts[0] in ("legs", "hand", "tracker", "later", "board"):
             names |= {"session.yaml", "joints.csv", "images/", "mechanism.yaml", "cameras/"}
             names |= {"poses.csv", "board.yaml", "distances.csv"}
+        if path.parts[0] == "models":  # of a model in several files
+            names |= {"whole.xml", "robot.urdf"}
     return names
 
 

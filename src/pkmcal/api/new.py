@@ -133,6 +133,7 @@ def new(
     arm: float | None = None,
     base_spacing: float | None = None,
     platform_spacing: float | None = None,
+    arm_angle: float | None = None,
     travel: float | None = None,
     tube_radius: float | None = None,
 ) -> NewResult:
@@ -180,6 +181,10 @@ def new(
         Length, m, of a crank.
     base_spacing, platform_spacing :
         Distances, m, between the joints of a pair of a hexapod; a fifth of the radius by default.
+    arm_angle :
+        Direction, rad, of the level arms of a rotary hexapod, seen from above: from outwards at
+        the middle of their pair (0) towards away from each other (pi / 2, by default); -pi / 2 if
+        they face each other.
     travel :
         Range, m, of the legs' lengths or the carriages' readings.
     tube_radius :
@@ -205,6 +210,7 @@ def new(
         "arm": arm,
         "base_spacing": base_spacing,
         "platform_spacing": platform_spacing,
+        "arm_angle": arm_angle,
         "travel": travel,
         "tube_radius": tube_radius,
     }

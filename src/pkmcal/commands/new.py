@@ -62,6 +62,10 @@ def _dimension(name: str, described: str, usual: str = "") -> Any:
     _dimension("arm", "Length of a crank."),
     _dimension("base_spacing", "Distance between the base joints of a pair.", SPACING),
     _dimension("platform_spacing", "Distance between the platform joints of a pair.", SPACING),
+    number(
+        "new", "arm_angle", "ANGLE", "Direction of a hexapod's level arms, from outwards at their"
+        " pair: -90 deg where they face each other.", usual="90 deg", group=DIMENSIONS_GROUP,
+    ),
     _dimension("travel", "How far legs change their lengths, or carriages move."),
     _dimension("tube_radius", "Radius of the legs' cylinders."),
     as_json(),

@@ -24,6 +24,7 @@ from pkmcal.exporters.home import (
     universal_hinges,
 )
 from pkmcal.exporters.limbs import FIXED_CARRIER, SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER
+from pkmcal.exporters.read_model import DISPLAY_MARK
 from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS, platform_carriers
@@ -441,10 +442,10 @@ def _tip(bodies: list[TreeBody], rod: TreeBody, home: HomeState, j: int) -> tupl
     if home.limbs.drive[j] == TELESCOPE_ROD:
         now, _, high = home.values(column).tolist()
         reach = high + length - now if np.isfinite(high) else length
-    # names of the file's tubes; cylinders added for display have none
+    # names of the file's tubes, and of cylinders added for display
     tubes = _tubes(home, j, reach)
     names = [f"leg{j + 1}_tube{k + 1}" for k in range(len(home.leg(j).tubes))]
-    names += [""] * (len(tubes) - len(names))
+    names += [f"leg{j + 1}{DISPLAY_MARK}{k + 1}" for k in range(len(tubes) - len(names))]
     if not home.length_varies(j):
         for (radius, start, stop), name in zip(tubes, names, strict=True):
             rod.shapes.append(RoundBar(start * u, min(stop, length) * u, radius, "rod", name))

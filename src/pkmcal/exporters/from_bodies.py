@@ -39,6 +39,10 @@ rad."""
 EQUAL_SHARE = 1e-9
 """Difference above which the nominal model's comment states it."""
 COMPARED_POSES = 8
+DRAWN_TUBES = (
+    "The legs' tubes are the cylinders that the file draws along them, at home: measure their"
+    " radii."
+)
 LEAST_SCALE, MOST_SCALE = 0.5, 2.0
 """Bounds of the ratio of a joint's value and its reading; beyond them it is a gear of something
 else."""
@@ -90,7 +94,7 @@ def _read(path: Path, text: str) -> tuple[ReadModel, str]:
     """Model of a file, and its format."""
     root = xml_root(text)
     if root.tag == "mujoco":
-        return read_mujoco(text), FORMATS[root.tag]
+        return read_mujoco(text, path.parent), FORMATS[root.tag]
     if root.tag == "sdf":
         return read_sdf(text), FORMATS[root.tag]
     if root.tag != "robot":
@@ -98,6 +102,13 @@ def _read(path: Path, text: str) -> tuple[ReadModel, str]:
             "the file is no model of bodies and joints",
             found=label_of(root),
             expected="<mujoco>, <sdf> or <robot>",
+        )
+    if foreign := [node.tag for node in root.iter() if "}" in node.tag]:
+        raise InputError(
+            "a xacro file is not read",
+            found=foreign[0],
+            expected="the URDF that it expands to",
+            next_step="Expand it with xacro: xacro FILE > FILE.urdf",
         )
     beside = path.with_name(path.stem + LOOPS_ENDING)
     if not beside.is_file():
@@ -164,6 +175,7 @@ def _nominal(model: ReadModel, form: str, path: Path, tube: float | None) -> Nom
         (
             f"The machine of {legible(path.name)}, {form}: base, platform and legs by its bodies"
             " and joints, in its frame, m and rad. The format has no ties between parameters.",
+            *((DRAWN_TUBES,) if tube is None and any(leg.tubes for leg in legs) else ()),
             *((f"Joints in no loop, held at home: {legible(listed(tool, 8))}.",) if tool else ()),
         ),
         (),

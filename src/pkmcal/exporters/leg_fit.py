@@ -9,8 +9,10 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
+from pkmcal.exporters.read_model import DISPLAY_MARK
 from pkmcal.exporters.rigid_bodies import RigidBodies, Step
-from pkmcal.geometry.rigid import cross, inverse, rotation
+from pkmcal.files import MOST_LEG_TUBES
+from pkmcal.geometry.rigid import apply, cross, inverse, rotation
 from pkmcal.levels import ROUNDING
 from pkmcal.starter.nominal import NominalLeg, millimetres
 
@@ -158,7 +160,29 @@ class LegFit:
             b_platform,
             held=held,
             scale="" if gear == 1 else number_text(1 / gear),
+            tubes=self._tubes(),
         )
+
+    def _tubes(self) -> tuple[tuple[float, float, float], ...]:
+        """Radius, start and end, m from A, of the cylinders that the leg is drawn with.
+
+        They are along its line, between its ends, and inside no thicker one.
+        """
+        tolerance = GEOMETRY_SHARE * self.parts.size
+        candidates: list[tuple[float, float, float]] = []
+        for cylinder in self.parts.model.cylinders:
+            away = apply(self.parts.at[cylinder.body], cylinder.ends) - self.a
+            along = away @ self.u
+            beside = float(np.linalg.norm(away - along[:, None] * self.u, axis=1).max())
+            start, stop = (float(x) for x in np.clip(np.sort(along), 0.0, self.length))
+            drawn = DISPLAY_MARK not in cylinder.name and cylinder.radius > tolerance
+            if drawn and beside < tolerance and stop - start > cylinder.radius:
+                candidates.append((cylinder.radius, start, stop))
+        out: list[tuple[float, float, float]] = []
+        for radius, start, stop in sorted(candidates, key=lambda tube: (-tube[0], tube[1])):
+            if not any(s - tolerance <= start and stop <= e + tolerance for _, s, e in out):
+                out.append((radius, start, stop))
+        return tuple(sorted(out, key=lambda tube: tube[1])[:MOST_LEG_TUBES])
 
     def _joint(self, side: str) -> str:
         """Entry of a joint on the base or on the platform."""

@@ -6,9 +6,11 @@ is refused; what only draws it is skipped.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from xml.etree.ElementTree import Element
+from pathlib import Path
+from xml.etree.ElementTree import Element, tostring
 
 import numpy as np
 
@@ -19,27 +21,47 @@ from pkmcal.exporters.read_model import (
     NO_LIMITS,
     ReadBody,
     ReadCoupling,
+    ReadCylinder,
     ReadJoint,
     ReadLoop,
     ReadModel,
     body_poses,
 )
-from pkmcal.exporters.xml_read import TUBE_MARK, attribute, refused, unit_axis, vector, xml_root
-from pkmcal.geometry.rigid import from_quaternion, inverse, pose, pose_difference, rotation
+from pkmcal.exporters.xml_read import (
+    LARGEST_MODEL_FILE,
+    MOST_ELEMENTS,
+    attribute,
+    check_size,
+    refused,
+    unit_axis,
+    vector,
+    xml_root,
+)
+from pkmcal.files import read_text
+from pkmcal.geometry.rigid import apply, from_quaternion, inverse, pose, pose_difference, rotation
 from pkmcal.levels import ROUNDING
 
-UNREAD_ELEMENTS = ("include", "replicate", "composite", "flexcomp", "frame", "attach")
-"""Elements that add bodies, or move those inside them."""
+UNREAD_ELEMENTS = ("composite", "flexcomp", "attach")
+"""Elements that add bodies."""
+FRAMES = ("frame", "replicate")
+"""Elements that move those inside them."""
 UNREAD_ORIENTATIONS = ("xyaxes", "zaxis")
+REFERENCES = ("body", "site", "joint", "tendon", "geom")
+"""Attributes that name other elements, without the number of two."""
+NAMES = ("name", *REFERENCES, *(f"{key}{k}" for key in REFERENCES for k in "12"))
 FREEDOMS = {"free": 6, "ball": 3, "hinge": 1, "slide": 1}
+NO_FRAME = np.eye(4)
 
 
-def read_mujoco(text: str) -> ReadModel:
+def read_mujoco(text: str, folder: Path | None = None) -> ReadModel:
     """Model of an MJCF text; loops close at home, as MuJoCo's compiler takes them.
 
-    Raises InputError for what is not read.
+    folder : of the files that the text includes; None for a text that may include none. Raises
+    InputError for what is not read.
     """
     root = xml_root(text)
+    _include(root, folder)
+    _replicate(root)
     for name in UNREAD_ELEMENTS:
         if (node := root.find(f".//{name}")) is not None:
             raise refused(node, f"<{name}> is not read", expected="bodies that are written out")
@@ -67,7 +89,7 @@ def read_mujoco(text: str) -> ReadModel:
         tuple(_loop(n, at, tree.sites) for n in nodes if n.tag in ("connect", "weld")),
         tuple(_coupling(n, joints) for n in nodes if n.tag == "joint"),
         tree.sites,
-        tree.radii,
+        tuple(tree.cylinders),
         np.array([joints[n.attrib["joint"]].dof for n in drives], dtype=int),
         # of other actuators the gear scales a force, not a value
         np.array([vector(n, "gear", "1", *range(1, 7))[0] if n.tag == "position" else 1.0
@@ -77,6 +99,83 @@ def read_mujoco(text: str) -> ReadModel:
         else np.array([float(word) for word in key.get("ctrl", "").split()]),
         drawn if key is None else _of_qpos(tree.bodies, drawn, key),
     )  # fmt: skip
+
+
+def _include(root: Element, folder: Path | None) -> None:
+    """Replace each ``<include file="…"/>`` by the elements of that file, which is in the folder or
+    below it, and is included once.
+    """
+    done = set[str]()
+    while found := [(parent, node) for parent in root.iter() for node in parent.findall("include")]:
+        for parent, node in found:
+            name = attribute(node, "file")
+            if folder is None or not _is_below(folder, name):
+                raise refused(
+                    node, "a file from elsewhere is not included", name, "one beside the document"
+                )
+            path = os.path.realpath(folder / name)
+            if path in done:
+                raise refused(node, "the file is included twice", name)
+            done.add(path)
+            text = read_text(Path(path), name, LARGEST_MODEL_FILE)
+            try:
+                inside = xml_root(text)
+            except InputError as error:
+                raise error.as_input(name) from None
+            at = list(parent).index(node)
+            parent[at : at + 1] = list(inside)
+        check_size(root)
+
+
+def _is_below(folder: Path, name: str) -> bool:
+    """Whether a file is in a folder or below it, wherever its links lead."""
+    return Path(os.path.realpath(folder / name)).is_relative_to(os.path.realpath(folder))
+
+
+def _replicate(root: Element) -> None:
+    """Replace each ``<replicate>`` by frames with copies of what is in it, innermost first.
+
+    Names have the copy's number added. Constraints and drives of nothing but bodies inside are
+    copied, too, as MuJoCo does.
+    """
+    parents = [(parent, node) for parent in root.iter() for node in parent.findall("replicate")]
+    for parent, node in reversed(parents):
+        count = vector(node, "count", "", 1)[0]
+        elements = sum(1 for _ in node.iter())
+        letters = len(tostring(node)) + elements * len(node.get("sep", ""))
+        if not (
+            count >= 1
+            and count == int(count)
+            and count * elements <= MOST_ELEMENTS
+            and count * letters <= LARGEST_MODEL_FILE
+        ):
+            raise refused(node, "this number of copies is not possible", node.get("count"))
+        endings = [f"{node.get('sep', '')}{k:0{len(str(int(count)))}}" for k in range(int(count))]
+        names = {part.get("name", "") for part in node.iter()} - {""}
+        at = list(parent).index(node)
+        parent[at : at + 1] = [_copy(node, names, ending, "frame") for ending in endings]
+        for k, frame in enumerate(parent[at : at + len(endings)]):
+            frame.set("copy", str(k))
+        for part in (*root.findall("equality"), *root.findall("actuator")):
+            for other in list(part):
+                ends = [value for key, value in other.items() if key.rstrip("12") in REFERENCES]
+                if ends and names.issuperset(ends):
+                    place = list(part).index(other)
+                    part[place : place + 1] = [
+                        _copy(other, {*names, other.get("name", "")} - {""}, ending, other.tag)
+                        for ending in endings
+                    ]
+        check_size(root)
+
+
+def _copy(node: Element, names: set[str], ending: str, tag: str) -> Element:
+    """Copy of an element with what is in it, with an ending after these names."""
+    out = Element(tag, node.attrib)
+    for key in NAMES:
+        if out.get(key) in names:
+            out.set(key, out.attrib[key] + ending)
+    out.extend(_copy(child, names, ending, child.tag) for child in node)
+    return out
 
 
 Classes = dict[str, dict[str, dict[str, str]]]
@@ -144,26 +243,56 @@ class _Bodies:
     units: tuple[float, str]
     bodies: list[ReadBody] = field(default_factory=lambda: [ReadBody("world", 0, np.eye(4), ())])
     sites: dict[str, tuple[int, Array]] = field(default_factory=dict[str, tuple[int, Array]])
-    radii: dict[str, float] = field(default_factory=dict[str, float])
+    cylinders: list[ReadCylinder] = field(default_factory=list[ReadCylinder])
     dofs: int = 0
     has_ball: bool = False
 
-    def collect(self, node: Element, number: int) -> None:
-        """Collect all below a body."""
+    def collect(self, node: Element, number: int, frame: Array = NO_FRAME) -> None:
+        """Collect all below a body; frame : (4, 4) pose in it of the element."""
         for site in node.findall("site"):
             if "name" in site.attrib:
-                self.sites[site.attrib["name"]] = (number, vector(site, "pos", "0 0 0"))
-        for geom in node.findall("geom"):
-            if TUBE_MARK in geom.get("name", ""):
-                self.radii[geom.attrib["name"]] = float(vector(geom, "size", "", 1, 2, 3)[0])
-        for child in node.findall("body"):
-            name = child.get("name", f"body {len(self.bodies)}")
-            self._add(child, name, number)
-            self.collect(child, len(self.bodies) - 1)
+                point = apply(frame, vector(site, "pos", "0 0 0"))
+                self.sites[site.attrib["name"]] = (number, point)
+        self.cylinders += [
+            self._cylinder(geom, number, frame)
+            for geom in node.findall("geom")
+            if geom.get("type") in ("cylinder", "capsule")
+            and "size" in geom.attrib
+            and not set(UNREAD_ORIENTATIONS) & set(geom.attrib)
+        ]
+        for child in node:
+            if child.tag in FRAMES:
+                if (joint := child.find("joint")) is not None:
+                    raise refused(joint, "a joint in a frame is not read", expected="in its body")
+                self.collect(child, number, frame @ self._frame(child))
+            elif child.tag == "body":
+                name = child.get("name", f"body {len(self.bodies)}")
+                self._add(child, name, number, frame)
+                self.collect(child, len(self.bodies) - 1)
 
-    def _add(self, node: Element, name: str, parent: int) -> None:
+    def _cylinder(self, node: Element, number: int, frame: Array) -> ReadCylinder:
+        """Cylinder or capsule of a body, by its ends or by its middle and half its length."""
+        if "fromto" in node.attrib:
+            radius, ends = vector(node, "size", "", 1, 2, 3)[0], vector(node, "fromto", "", 6)
+            ends = ends.reshape(2, 3)
+        else:
+            radius, half, *_ = vector(node, "size", "", 2, 3)
+            place = pose(self._turn(node), vector(node, "pos", "0 0 0"))
+            ends = apply(place, np.array([[0, 0, -half], [0, 0, half]]))
+        return ReadCylinder(node.get("name", ""), number, apply(frame, ends), float(radius))
+
+    def _frame(self, node: Element) -> Array:
+        """Pose (4, 4) of a frame; of a copy, that of as many steps as its number."""
+        if (copies := node.get("copy")) is None:
+            return pose(self._turn(node), vector(node, "pos", "0 0 0"))
+        step, place = vector(node, "euler", "0 0 0"), np.zeros(3)
+        for k in range(int(copies)):
+            place = place + self._euler(k * step) @ vector(node, "offset", "0 0 0")
+        return pose(self._euler(int(copies) * step), place)
+
+    def _add(self, node: Element, name: str, parent: int, frame: Array) -> None:
         """Add a body, and one for each further position of joints on it."""
-        place = pose(self._turn(node), vector(node, "pos", "0 0 0"))
+        place = frame @ pose(self._turn(node), vector(node, "pos", "0 0 0"))
         groups: list[tuple[Array, list[ReadJoint]]] = [(np.zeros(3), [])]
         for j in node:
             if j.tag in ("joint", "freejoint"):
@@ -209,21 +338,24 @@ class _Bodies:
         for key in UNREAD_ORIENTATIONS:
             if key in node.attrib:
                 raise refused(node, "this orientation is not read", key, "quat or euler")
-        factor, sequence = self.units
         if "axisangle" in node.attrib:
             *axis, angle = vector(node, "axisangle", "", 4)
-            return rotation(factor * angle * unit_axis(node, np.array(axis)))
+            return rotation(self.units[0] * angle * unit_axis(node, np.array(axis)))
         if "euler" in node.attrib:
-            out = np.eye(3)
-            for axis, angle in zip(sequence, factor * vector(node, "euler", ""), strict=True):
-                turn = rotation(angle * np.eye(3)["xyz".index(axis.lower())])
-                # lower-case axes turn with the body, capital ones are fixed
-                out = out @ turn if axis.islower() else turn @ out
-            return out
+            return self._euler(vector(node, "euler", ""))
         quaternion = vector(node, "quat", "1 0 0 0", 4)
         if not np.any(quaternion):
             raise refused(node, "a quaternion of zeros is no orientation")
         return from_quaternion(quaternion / np.linalg.norm(quaternion))
+
+    def _euler(self, angles: Array) -> Array:
+        """Orientation (3, 3) of Euler angles (3,) in the file's unit."""
+        (factor, sequence), out = self.units, np.eye(3)
+        for axis, angle in zip(sequence, factor * angles, strict=True):
+            turn = rotation(angle * np.eye(3)["xyz".index(axis.lower())])
+            # lower-case axes turn with the body, capital ones are fixed
+            out = out @ turn if axis.islower() else turn @ out
+        return out
 
 
 def _drives(root: Element, joints: dict[str, ReadJoint]) -> list[Element]:

@@ -25,6 +25,8 @@ from pkmcal.geometry.rigid import (
 NO_TRANSLATION = np.zeros(3)
 JOINT_BODY = " joint"
 """End of the names of bodies that readers add where a joint is beside its body's origin."""
+DISPLAY_MARK = "_display"
+"""Part of the names of cylinders that exports add for display, with radii of no tube."""
 NO_LIMITS = np.full(2, np.nan)
 MOST_CLOSING_STEPS = 30
 LOOPS_CLOSED_STEP = 1e-13
@@ -68,6 +70,18 @@ class ReadBody(NamedTuple):
     joints: tuple[ReadJoint, ...]
 
 
+class ReadCylinder(NamedTuple):
+    """Cylinder or capsule that a body is drawn with.
+
+    body : index. ends : (2, 3) ends of its axis, m, body frame. radius : m.
+    """
+
+    name: str
+    body: int
+    ends: Array
+    radius: float
+
+
 class ReadLoop(NamedTuple):
     """Constraint that the frames of two bodies coincide.
 
@@ -97,7 +111,7 @@ class ReadModel:
     the perturbation of its body's pose at home.
 
     sites : points by name, (body, (3,)).
-    radii : radii of cylinders by name, m.
+    cylinders : of all bodies.
     actuated : degrees of freedom of the readings' joints, in order.
     gear : (m,) factors from these joints' values to readings.
     ctrl : (m,) readings at the key.
@@ -108,11 +122,16 @@ class ReadModel:
     loops: tuple[ReadLoop, ...]
     couplings: tuple[ReadCoupling, ...]
     sites: dict[str, tuple[int, Array]]
-    radii: dict[str, float]
+    cylinders: tuple[ReadCylinder, ...]
     actuated: Integers
     gear: Array
     ctrl: Array
     key: Array
+
+    @property
+    def radii(self) -> dict[str, float]:
+        """Radii of the cylinders by name, m."""
+        return {cylinder.name: cylinder.radius for cylinder in self.cylinders}
 
     def places(self, x: Array) -> dict[str, Array]:
         """Poses (..., 4, 4) of all bodies by name, world frame."""

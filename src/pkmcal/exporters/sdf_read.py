@@ -12,12 +12,12 @@ from pkmcal.exporters.read_model import (
     JOINT_BODY,
     ReadBody,
     ReadCoupling,
+    ReadCylinder,
     ReadJoint,
     ReadLoop,
     ReadModel,
 )
 from pkmcal.exporters.xml_read import (
-    TUBE_MARK,
     attribute,
     label_of,
     limits_of,
@@ -26,7 +26,7 @@ from pkmcal.exporters.xml_read import (
     unit_axis,
     xml_root,
 )
-from pkmcal.geometry.rigid import from_roll_pitch_yaw, inverse, pose
+from pkmcal.geometry.rigid import apply, from_roll_pitch_yaw, inverse, pose
 
 SDF_NAMESPACE = "urn:pkmcal"
 SDF_MODEL_FRAME, SDF_WORLD_FRAME = "__model__", "world"
@@ -93,12 +93,13 @@ def read_sdf(text: str) -> ReadModel:
             if (mimic := node.find("axis/mimic")) is not None
         ),
         sites=sites,
-        radii={
-            name: float(numbers(node, radius.text or "", (1,), "radius")[0])
-            for node in model.iter("visual")
-            if TUBE_MARK in (name := node.get("name", ""))
-            and (radius := node.find("geometry/cylinder/radius")) is not None
-        },
+        cylinders=tuple(
+            tree.cylinder(visual, cylinder, link)
+            for link, node in tree.links.items()
+            for visual in node.findall("visual")
+            for kind in ("cylinder", "capsule")
+            if (cylinder := visual.find(f"geometry/{kind}")) is not None
+        ),
         actuated=np.array([tree.joint(n, model).dof for n in tree.readings], dtype=int),
         gear=np.array([1 / float(values["scale"]) for values in tree.readings.values()]),
         ctrl=np.array([float(values["home"]) for values in tree.readings.values()]),
@@ -198,6 +199,19 @@ class _Links:
         text = (place.text or "").strip() or "0 0 0 0 0 0"
         values = numbers(node, text, (6,), "pose")
         return pose(from_roll_pitch_yaw(values[3:]), values[:3])
+
+    def cylinder(self, visual: Element, cylinder: Element, link: str) -> ReadCylinder:
+        """Cylinder along z of a visual's pose."""
+        radius, length = (
+            float(numbers(cylinder, cylinder.findtext(key, ""), (1,), key)[0])
+            for key in ("radius", "length")
+        )
+        ends = np.array([[0, 0, -length / 2], [0, 0, length / 2]])
+        place = visual.find("pose")
+        stated = "" if place is None else place.get("relative_to", "")
+        turn = np.eye(4) if not stated else inverse(self.drawn(link)) @ self.drawn(stated)
+        ends = apply(turn @ self.own_pose(visual), ends)
+        return ReadCylinder(visual.get("name", ""), self.numbers[link], ends, radius)
 
     def put(self, link: str) -> int:
         """Index of a link's body, added if necessary."""

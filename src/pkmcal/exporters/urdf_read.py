@@ -18,12 +18,12 @@ from pkmcal.exporters.read_model import (
     NO_LIMITS,
     ReadBody,
     ReadCoupling,
+    ReadCylinder,
     ReadJoint,
     ReadLoop,
     ReadModel,
 )
 from pkmcal.exporters.xml_read import (
-    TUBE_MARK,
     attribute,
     limits_of,
     numbers,
@@ -33,7 +33,7 @@ from pkmcal.exporters.xml_read import (
     xml_root,
 )
 from pkmcal.files import Schema, parse_yaml, validated_document
-from pkmcal.geometry.rigid import from_roll_pitch_yaw, pose
+from pkmcal.geometry.rigid import apply, from_roll_pitch_yaw, pose
 
 URDF_JOINT_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}
 
@@ -69,10 +69,6 @@ def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadMode
     """
     root = xml_root(text)
     beside = validated_document(parse_yaml(loops, Path(loops_name)), LoopsDocument)
-    if foreign := [node for node in root.iter() if "}" in node.tag]:
-        raise InputError(
-            "a xacro file is not read", found=foreign[0].tag, expected="the URDF that it expands to"
-        )
     tree = _Tree(root, loops_name)
     couplings = _couplings(root, tree)
     # the state at home
@@ -97,12 +93,12 @@ def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadMode
         ),
         couplings=couplings,
         sites={name: (body, np.zeros(3)) for name, body in sites.items()},
-        radii={
-            name: float(vector(cylinder, "radius", "", 1)[0])
-            for node in root.iter("visual")
-            if TUBE_MARK in (name := node.get("name", ""))
-            and (cylinder := node.find("geometry/cylinder")) is not None
-        },
+        cylinders=tuple(
+            _cylinder(visual, cylinder, tree.numbers[name])
+            for name, link in tree.links.items()
+            for visual in link.findall("visual")
+            if (cylinder := visual.find("geometry/cylinder")) is not None
+        ),
         actuated=np.array([tree.joint(r.joint).dof for r in beside.readings], dtype=int),
         gear=np.array([1 / r.scale for r in beside.readings]),
         ctrl=np.array([r.home for r in beside.readings]),
@@ -197,6 +193,14 @@ def _joint(node: Element, dof: int) -> ReadJoint:
     if limit is not None:
         limits = limits_of(limit, limit.get("lower"), limit.get("upper"))
     return ReadJoint(attribute(node, "name"), kind, unit_axis(node, axis), dof, 0.0, limits)
+
+
+def _cylinder(visual: Element, cylinder: Element, body: int) -> ReadCylinder:
+    """Cylinder along z of a visual's origin."""
+    half = float(vector(cylinder, "length", "", 1)[0]) / 2
+    ends = apply(_origin_pose(visual), np.array([[0, 0, -half], [0, 0, half]]))
+    radius = float(vector(cylinder, "radius", "", 1)[0])
+    return ReadCylinder(visual.get("name", ""), body, ends, radius)
 
 
 def _origin_pose(node: Element) -> Array:

@@ -17,8 +17,8 @@ MOST_PARTS, PART_TAGS = 600, frozenset({"body", "link", "joint", "connect", "wel
 """Most bodies and joints of a machine, and the elements that are one."""
 LARGEST_MODEL_FILE = 2**22
 """Largest file of a model, bytes."""
-TUBE_MARK = "_tube"
-"""Part of the names of the cylinders that are a leg's; other shapes are not read."""
+LARGEST_NUMBER = 1e30
+"""Largest number of a model but limits, in any unit; squares of larger ones overflow."""
 LARGEST_LIMIT = 1e3
 """Joint limit, m or rad, above which it stands for none."""
 
@@ -36,6 +36,12 @@ def xml_root(text: str) -> Element:
         root = fromstring(text)
     except (ParseError, ValueError) as error:
         raise InputError("the file is not XML", found=str(error)) from None
+    check_size(root)
+    return root
+
+
+def check_size(root: Element) -> None:
+    """Raise InputError for a tree that is too large for a machine."""
     elements, level, layer = 0, 0, [root]
     while layer:
         elements, level = elements + len(layer), level + 1
@@ -53,7 +59,6 @@ def xml_root(text: str) -> Element:
             found=parts,
             expected=f"at most {MOST_PARTS}",
         )
-    return root
 
 
 def label_of(node: Element) -> str:
@@ -74,13 +79,19 @@ def attribute(node: Element, key: str) -> str:
     return node.attrib[key]
 
 
-def numbers(node: Element, text: str, counts: tuple[int, ...], what: str) -> Array:
+def numbers(
+    node: Element,
+    text: str,
+    counts: tuple[int, ...],
+    what: str,
+    largest: float = LARGEST_NUMBER,
+) -> Array:
     """Finite numbers of a text, as many as one of ``counts``; ``what`` is its name in messages."""
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.array([np.nan])
-    if values.size not in counts or not np.isfinite(values).all():
+    if values.size not in counts or not np.all(np.abs(values) <= largest):
         raise refused(
             node,
             f"{what} is not as many numbers as it takes",
@@ -107,5 +118,8 @@ def unit_axis(node: Element, axis: Array) -> Array:
 def limits_of(node: Element, low: str | None, high: str | None) -> Array:
     """Limits (2,) of a joint; infinite ones, such as 1e16, are NaN."""
     texts = (low, high)
-    values = np.array([numbers(node, text, (1,), "limit")[0] if text else np.nan for text in texts])
+    values = np.array([
+        numbers(node, text, (1,), "limit", np.finfo(float).max)[0] if text else np.nan
+        for text in texts
+    ])  # fmt: skip
     return np.where(np.abs(values) < LARGEST_LIMIT, values, np.nan)

@@ -31,6 +31,7 @@ from pkmcal.observe.distance_tables import (
     distance_tables,
 )
 from pkmcal.observe.image_batches import StationImages
+from pkmcal.observe.legs import EDGE_OPTIONS
 from pkmcal.observe.pose_candidates import (
     CANDIDATE_OPTIONS,
     CandidateOptions,
@@ -40,12 +41,13 @@ from pkmcal.observe.pose_candidates import (
 )
 from pkmcal.observe.pose_likelihood import (
     StationView,
+    distances_under,
     distinct_silhouettes,
-    log_likelihood_of,
+    mixture_of,
     refine_lm,
     refine_ml,
 )
-from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
+from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed, visible_stretch
 from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, TubeChart, TubeChartOptions, tube_chart
 
 
@@ -67,8 +69,10 @@ class ImageLocalizationOptions:
     stride: int = 2
     # number of image positions retained for each camera position and rotation
     positions: int = 2
-    # number of hypotheses that are refined; in a cluttered laboratory the correct one is among the
-    # first thousand (measured)
+    # number of hypotheses of the chart; in a cluttered laboratory the correct one is among the
+    # first thousand, with two of six legs hidden among the first five thousand (measured)
+    charted: int = 8000
+    # number of hypotheses that are refined
     refined: int = 2000
     # number of hypotheses retained after the first descent
     on_coarse: int = 400
@@ -159,13 +163,14 @@ def localize_image(
     fine = replace(view, tables=distance_tables([image], options.tables_at(2)))
     # chart of tubes, then robust descents on tables of the usual resolution
     hypotheses = _hypotheses(view, tube_chart(image, view.camera, options.chart), options)
+    hypotheses = _most(coarse, hypotheses, 3, options.refined)
     hypotheses = refine_lm(coarse, hypotheses, one, 2, options.first_reaches)
     hypotheses = _most(coarse, hypotheses, 4, options.on_coarse)
     hypotheses = refine_lm(coarse, hypotheses, one, 4, options.next_reaches)
     hypotheses = _most(coarse, hypotheses, 5, options.on_finer)
     # maximum likelihood at twice the resolution
-    hypotheses, log_likelihood_ratio = refine_ml(fine, hypotheses, one, 8, 6)
-    hypotheses = hypotheses[np.argsort(-log_likelihood_ratio)]
+    hypotheses, _ = refine_ml(fine, hypotheses, one, 8, 6)
+    hypotheses = _most(fine, hypotheses, 8, options.on_finer)
     hypotheses = hypotheses[distinct_silhouettes(fine, hypotheses, one)][: options.on_finest]
     # and, with the symmetric poses of the best two, at four times
     return weighed_poses(
@@ -189,7 +194,8 @@ def weighed_poses(
     """
     one = np.zeros(1, dtype=int)
     view = replace(view, tables=distance_tables([image], options.tables_at(4)))
-    values, log_likelihood_ratio = refine_ml(view, values, one, 16, 6)
+    values, _ = refine_ml(view, values, one, 16, 6)
+    log_likelihood_ratio = _log_likelihood(view, values, 16)
     order = np.argsort(-log_likelihood_ratio)
     order = order[log_likelihood_ratio[order] > 0]
     if not len(order):
@@ -294,10 +300,22 @@ def _starts_near(
 
 def _most(view: StationView, values: Array, samples: int, count: int) -> Array:
     """The ``count`` poses with the largest log-likelihood ratio."""
-    log_likelihood_ratio = log_likelihood_of(view, values, np.zeros(1, dtype=int), samples).sum(
-        axis=-1
+    return values[np.argsort(-_log_likelihood(view, values, samples))[:count]]
+
+
+def _log_likelihood(view: StationView, values: Array, samples: int) -> Array:
+    """Log-likelihood ratios (H,) of poses (H, 4, 4) by the silhouettes that no other leg hides or
+    borders: with two legs on one line in the image, its edges would count twice.
+    """
+    one = np.zeros(1, dtype=int)
+    distances = distances_under(view, values, one, samples)
+    legs = view.legs(one).under(values)[:, 0]
+    points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
+    clear = unobstructed(
+        view.machine, view.camera, legs, view.tubes, points, EDGE_OPTIONS.clearance
     )
-    return values[np.argsort(-log_likelihood_ratio)[:count]]
+    distances = distances._replace(length=np.where(clear, distances.length, 0.0))
+    return distances.log_likelihood(mixture_of(distances, view.options)).sum(axis=(1, 2))
 
 
 class _Tubes(NamedTuple):
@@ -354,7 +372,7 @@ def _hypotheses(view: StationView, chart: TubeChart, options: ImageLocalizationO
                 np.put_along_axis(score, best, -np.inf, axis=-1)
     # now (direction, distance x rotation x positions)
     value, best = (np.concatenate(part, axis=-1).T for part in (values, shifts))
-    order = np.argsort(-value.ravel())[: options.refined]
+    order = np.argsort(-value.ravel())[: options.charted]
     row, place = np.unravel_index(order, value.shape)
     step, shift = row // options.positions, best[row, place]
     # poses from the indices: direction, roll about the optical axis, tilt to the image position

@@ -1,5 +1,5 @@
 """Nominal models of common families of machines from few numbers: radii of the joint circles,
-lengths of legs and arms.
+lengths of legs and arms, direction of the arms.
 
 Every family has a rigid platform with joints on one circle, in the plane z = 0 of its frame, and
 the base joints on another, in the plane z = 0 of the base frame.
@@ -43,6 +43,10 @@ DIMENSIONS: Mapping[str, tuple[str, str]] = MappingProxyType(
             "Distance between the two platform joints of a pair, of which there are three, 120",
             "degrees apart, each pair opposite the gap between two pairs of the base.",
         ),
+        "arm_angle": (
+            "Direction of a level arm, seen from above, from outwards at its pair (0) towards away",
+            "from the other arm (90 deg); -90 deg: the arms of a pair point at each other.",
+        ),
         "travel": (
             "How far a motor moves, from stop to stop: a leg's length about that at home, a",
             "carriage from the height that the bed needs. Without it the file has no range.",
@@ -56,6 +60,8 @@ DIMENSIONS: Mapping[str, tuple[str, str]] = MappingProxyType(
 """What each number is and how it is measured, two lines each; base_radius is that of a family."""
 ASSUMED_SPACING_SHARE = 0.2
 """Distance between the joints of a pair, relative to their circle's radius, if it is not given."""
+AWAY = np.pi / 2
+"""Angle of an arm, if it is not given."""
 PAIRED = (0.0, 120.0, 240.0)
 ROTARY_DELTA, LINEAR_DELTA = (90.0, 210.0, 330.0), (210.0, 330.0, 90.0)
 """Directions of pairs, arms and towers in the base frame, degrees anticlockwise from x."""
@@ -69,8 +75,8 @@ class Family:
 
     title : what they are. base : what base_radius is, two lines. layout : sentences on legs and
     readings, for the file. needs, takes : names of the numbers that are required, and optional.
-    legs : nominal legs of the numbers, m. height : height of the platform at home, m, of the
-    numbers and the horizontal distance of a leg's joints there.
+    legs : nominal legs of the numbers. height : height of the platform at home, m, of the numbers
+    and the horizontal distance of a leg's joints there. Numbers are in m and rad.
     """
 
     title: str
@@ -119,8 +125,8 @@ def _hexapod(numbers: Numbers) -> list[NominalLeg]:
 def _rotary_hexapod(numbers: Numbers) -> list[NominalLeg]:
     legs = []
     for pair, side, base, platform in _pairs(numbers):
-        # arms of a pair point away from each other, and both rise with their readings
-        out = side * _tangent(pair)
+        # mirrored at the plane of the pair, and both rise with their readings
+        out = on_circle(1.0, pair + side * np.rad2deg(numbers["arm_angle"]))
         axis = np.cross(out, [0.0, 0.0, 1.0])
         legs.append(NominalLeg.crank(base, axis, out, numbers["arm"], platform, numbers["leg"]))
     return legs
@@ -192,11 +198,11 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
                 "meets the plane in which the end of its arm moves.",
             ),
             "Legs are numbered anticlockwise, seen from above; legs 1 and 2 start at the pair on x,"
-            " leg 1 at its clockwise servo. The axes of a pair are parallel, its arms point away"
-            " from each other, level at 0, and both rise with their readings.",
+            " leg 1 at its clockwise servo. The servos of a pair are mirrored: its arms, level at"
+            " 0, both rise with their readings, so one of two equal servos has the other sign.",
             "spatial",
             ("base_radius", "platform_radius", "arm", "leg"),
-            (*_SPACINGS, "tube_radius"),
+            (*_SPACINGS, "arm_angle", "tube_radius"),
             _rotary_hexapod,
             _rise,
         ),
@@ -233,7 +239,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
 
 
 def family_model(name: str | None, given: Numbers) -> NominalModel:
-    """Nominal model of a family's numbers, m.
+    """Nominal model of a family's numbers, m and rad.
 
     Raises InputError for another family, missing numbers, numbers of other families, and numbers
     of which no machine can be made.
@@ -265,6 +271,9 @@ def family_model(name: str | None, given: Numbers) -> NominalModel:
         if f"{end}_spacing" in family.takes and f"{end}_spacing" not in given:
             numbers[f"{end}_spacing"] = ASSUMED_SPACING_SHARE * given[f"{end}_radius"]
             assumed.append(f"{end}_spacing")
+    if "arm_angle" in family.takes and "arm_angle" not in given:
+        numbers["arm_angle"] = AWAY
+        assumed.append("arm_angle")
     _check_numbers(numbers)
     legs = family.legs(numbers)
     # by symmetry all legs are alike: the first stands for them
@@ -281,7 +290,7 @@ def family_model(name: str | None, given: Numbers) -> NominalModel:
         name,
         (family.title + ".", family.layout),
         tuple(
-            (f"{number}: {millimetres(numbers[number])}"
+            (f"{number}: {_written(number, numbers[number])}"
              + ("  (assumed, not given: measure it)" if number in assumed else ""),
              *(family.base if number == "base_radius" else DIMENSIONS[number]))
             for number in FAMILY_DIMENSIONS if number in numbers
@@ -297,6 +306,11 @@ def family_model(name: str | None, given: Numbers) -> NominalModel:
         "base and platform of different shapes, such as smaller spacings of the pairs",
     )
     return model
+
+
+def _written(name: str, value: float) -> str:
+    """Number with its unit."""
+    return f"{np.rad2deg(value):.10g} deg" if name == "arm_angle" else millimetres(value)
 
 
 def _check_numbers(numbers: Numbers) -> None:

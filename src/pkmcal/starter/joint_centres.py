@@ -63,7 +63,7 @@ class JointCentres(StarterSource):
             raise InputError(
                 "joint centres need the legs' length at home",
                 where="--from",
-                found="no --leg",
+                found=f"{path.name} without --leg",
                 expected="--leg LENGTH, and where known --travel and --tube-radius",
             )
         screws: tuple[Screw, ...] | None = None
@@ -77,12 +77,13 @@ class JointCentres(StarterSource):
                     expected=EXPECTED_HEADER,
                 )
             base, platform = _of_table(text, path.name)
-        largest = float(np.abs([base, platform]).max())
-        if largest > LARGEST_UNITLESS_LENGTH:
+        centres = np.abs(np.hstack([base, platform]))
+        leg, column = np.unravel_index(centres.argmax(), centres.shape)
+        if centres[leg, column] > LARGEST_UNITLESS_LENGTH:
             raise InputError(
                 "a joint centre is too far from the frame's origin",
-                where=path.name,
-                found=f"{largest:.3g} m",
+                where=f"{path.name}, leg {leg + 1}, {COLUMNS[column]}",
+                found=f"{centres[leg, column]:.3g} m",
                 expected=f"at most {LARGEST_UNITLESS_LENGTH:g} m",
                 next_step="Check the unit",
             )

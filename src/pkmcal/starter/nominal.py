@@ -14,6 +14,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import parse_yaml, validated_document
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+from pkmcal.wording import listed
 
 TOLERANCE_SHARE, LARGEST_TOLERANCE = 0.02, 0.002
 """Standard deviation of a centre relative to the longest leg, and its largest value, m: a ruler
@@ -49,7 +50,8 @@ class NominalLeg:
     base, rod : their entries in the file. start : A (3,) at home, base frame. platform : B (3,),
     platform frame. least : shortest length; None for that at home. axis : (3,) of its universal
     joint on the platform; None for a spherical one. held : the platform's entry, where it is
-    neither of these. scale : of the reading; 1 if empty.
+    neither of these. scale : of the reading; 1 if empty. tubes : radius, start and end of
+    cylinders, m from A.
     """
 
     base: str
@@ -60,6 +62,7 @@ class NominalLeg:
     axis: Array | None = None
     held: str = ""
     scale: str = ""
+    tubes: tuple[tuple[float, float, float], ...] = ()
 
     __repr__ = short_repr
 
@@ -172,6 +175,21 @@ class NominalModel:
         document = parse_yaml(self.text(), Path("mechanism.yaml"))
         return checked_machine(validated_document(document, MechanismDocument), document)
 
+    def check_reach(self, where: str) -> None:
+        """Raise InputError for a model with legs that do not reach the platform at home.
+
+        where : of the message.
+        """
+        machine = self.machine()
+        readings = machine.inverse(machine.home()[None])[0]
+        if not np.isfinite(readings).all():
+            raise InputError(
+                "legs do not reach the platform at home",
+                where=where,
+                found=listed([str(k + 1) for k in np.flatnonzero(~np.isfinite(readings))]),
+                expected="lengths, arms or spools with which they do",
+            )
+
     def check_home(self, where: str, expected: str | None = None) -> None:
         """Raise InputError for a model whose platform could move at home with all motors at rest.
 
@@ -192,14 +210,16 @@ class NominalModel:
         platform = leg.held or _joint(leg.platform, leg.axis)
         text = f"  - base: {leg.base}\n    platform: {platform}\n    length: {leg.rod}\n"
         text += f"    scale: {leg.scale}\n" if leg.scale else ""
-        if self.tube_radius is None:
-            return text
-        length = float(np.linalg.norm(leg.platform + self.home - leg.start))
-        start, stop = ((leg.least or length) * share for share in TUBE_PART)
-        return text + (
-            f"    tubes: [{{radius: {millimetres(self.tube_radius)}, from: {millimetres(start)},"
-            f" to: {millimetres(stop)}}}]\n"
-        )
+        tubes = leg.tubes
+        if self.tube_radius is not None:
+            length = float(np.linalg.norm(leg.platform + self.home - leg.start))
+            start, stop = ((leg.least or length) * share for share in TUBE_PART)
+            tubes = ((self.tube_radius, start, stop),)
+        entries = [
+            f"{{radius: {radius}, from: {start}, to: {stop}}}"
+            for radius, start, stop in (map(millimetres, tube) for tube in tubes)
+        ]
+        return f"{text}    tubes: [{', '.join(entries)}]\n" if tubes else text
 
 
 def _numbers(values: Array | tuple[float, ...]) -> str:

@@ -70,8 +70,8 @@ def read_source(
 
     unit : of its lengths, None unless the user named it. given : dimensions by name, m.
 
-    Raises InputError for a file that no source or more than one claims, and for options that its
-    source does not take.
+    Raises InputError for a file that no source or more than one claims, for options that its
+    source does not take, and for a machine that does not reach its home.
     """
     text = read_text(path)
     claiming = [one for one in starter_sources() if one.claims(text, path)]
@@ -95,4 +95,7 @@ def read_source(
             if source.options
             else f"--from {path.name} alone",
         )
-    return source.read(text, path, unit, given)
+    out = source.read(text, path, unit, given)
+    if isinstance(out, NominalModel):
+        out.check_reach(path.name)
+    return out

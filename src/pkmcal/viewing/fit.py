@@ -12,7 +12,13 @@ from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, find_station
 from pkmcal.viewing.content import SessionContent
-from pkmcal.viewing.overlay import overlay_after_gesture, pane_of, placed_by_hand, pose_rows
+from pkmcal.viewing.overlay import (
+    overlay_after_gesture,
+    pane_of,
+    pin_offsets,
+    placed_by_hand,
+    pose_rows,
+)
 from pkmcal.web.session_document import LocalizationAnswer, ViewRequest
 from pkmcal.wording import brief, count
 
@@ -54,6 +60,18 @@ def localized_overlay(content: SessionContent, request: ViewRequest) -> Localiza
     else:
         image = content.image(request.station, request.image)
         localized, sure, text = _from_one_image(view, image, near)
+    if sure and request.pins:
+        # a leg's silhouettes allow it to slide along itself; the joints that a person placed do not
+        off = pin_offsets(content, request, localized)
+        off = off[off > pin_offsets(content, request, start)]
+        if off.size:
+            sure, text = (
+                False,
+                (
+                    f"Not placed: the best fit moves a joint that you placed by {off.max():.0f} px"
+                    " more than your hand and the nominal model allow, so your place is retained."
+                ),
+            )
     pose = localized if sure else start
     # overlay at the localized pose, without the gesture and pins that led to the start
     plain = {"pose": pose_rows(pose), "gesture": None, "pins": ()}

@@ -24,13 +24,24 @@ from pkmcal.observe.overlays import (
 from pkmcal.outcome.blocks.base import Pose
 from pkmcal.outcome.blocks.machine import Property
 from pkmcal.viewing.content import Pane, SessionContent
-from pkmcal.viewing.gestures import aimed, farther, pinned, rolled, turned_as_ball
+from pkmcal.viewing.gestures import (
+    PINNED_JOINT_SIGMA,
+    aimed,
+    farther,
+    pinned,
+    rolled,
+    turned_as_ball,
+)
 from pkmcal.web.session_document import JointPixel, OverlayAnswer, ViewRequest
 from pkmcal.web.stage import pose_row
 from pkmcal.wording import number
 
 STATION_POSE_DECIMALS = 4
 """Decimals of a written position in m; nobody places a camera to a tenth of a millimetre."""
+
+
+PIN_SIGMAS = 3.0
+"""Standard deviations of a pinned joint's place beyond which a pose contradicts it."""
 
 
 def pane_of(content: SessionContent, request: ViewRequest) -> Pane:
@@ -86,9 +97,7 @@ def placed_by_hand(content: SessionContent, request: ViewRequest) -> Pane:
     camera, points = pane.camera, pane.points.reshape(-1, 3)
     # pins first, then the gesture
     if request.pins:
-        pins = np.stack([_joint(content, request, k) for k in range(len(request.pins))])
-        pixels = np.array([pin.pixel for pin in request.pins], dtype=float)
-        T_camera_base = pinned(camera, T_camera_base, points, pins, pixels)
+        T_camera_base = pinned(camera, T_camera_base, points, *_pins(content, request))
     if request.gesture is not None:
         start, end = (
             np.array(p, dtype=float) for p in (request.gesture.start, request.gesture.end)
@@ -111,6 +120,29 @@ def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     from pkmcal.placement.stations import StationPose
 
     return StationPose.of(T_camera_base).rounded(STATION_POSE_DECIMALS)
+
+
+def pin_offsets(content: SessionContent, request: ViewRequest, T_camera_base: Array) -> Array:
+    """Distances (n,), px, of pinned joints at a pose (4, 4) from where they were placed, beyond
+    those that the nominal model's tolerance and a hand allow; infinite out of the image.
+    """
+    pane = pane_of(content, request)
+    pins, pixels = _pins(content, request)
+    points = apply(T_camera_base, pins)
+    visible = pane.camera.project(points)
+    # pixels of the tolerance, across the line of sight
+    shift = pane.machine.document.tolerance.center * np.eye(3)[0]
+    sigma = np.hypot(*(pane.camera.project(points + shift) - visible).T)
+    allowed = PIN_SIGMAS * np.hypot(sigma, PINNED_JOINT_SIGMA)
+    offsets = np.hypot(*(visible - pixels).T) - allowed
+    return np.nan_to_num(np.maximum(offsets, 0.0), nan=np.inf)
+
+
+def _pins(content: SessionContent, request: ViewRequest) -> tuple[Array, Array]:
+    """Pinned joints (n, 3), base frame, m, and their pixels (n, 2)."""
+    pins = [_joint(content, request, k) for k in range(len(request.pins))]
+    pixels = np.array([pin.pixel for pin in request.pins], dtype=float)
+    return np.reshape(pins, (-1, 3)), pixels.reshape(-1, 2)
 
 
 def _joint(content: SessionContent, request: ViewRequest, k: int) -> Array:
