@@ -374,11 +374,15 @@ def test_a_circles_centre_is_not_its_images_centroid(tmp_path):
     assert np.sqrt(np.mean((centres - truth) ** 2)) < 0.02
 
 
-@pytest.mark.parametrize("kind", ["circle_grid", "kalibr_aprilgrid"])
-def test_boards_of_other_programs_are_not_printed(tmp_path, kind):
-    with pytest.raises(InputError) as caught:
-        Print.of(board_of(tmp_path, FILES[kind]))
-    assert caught.value.what == "boards of this kind are not printed"
+def test_a_printed_aprilgrid_is_kalibrs(tmp_path):
+    """Tags, their order and the black squares, as drawn from Kalibr's rules."""
+    board = board_of(tmp_path, FILES["kalibr_aprilgrid"])
+    image, first, scale = texture(board)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    dark = Print.of(board).dark_at(
+        (x.ravel() + 0.5 - first) / scale, (y.ravel() + 0.5 - first) / scale
+    )
+    assert np.mean((image < 100) == dark.reshape(image.shape)) > 0.999
 
 
 def test_grids_that_look_the_same_turned_by_half(tmp_path):
