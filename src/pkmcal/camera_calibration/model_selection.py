@@ -289,19 +289,19 @@ def camera_candidates(
     fits: list[tuple[str, tuple[str, ...], CameraFit]] = []
     # Models for wide lenses first: they fit almost any lens, and show which others are hopeless.
     for model in sorted(models, key=CALIBRATED_MODELS.index, reverse=True):
-        start = first_fit(model, views, image_size, options=options)
-        if start is None:
+        first = first_fit(model, views, image_size, options=options)
+        if first is None:
             continue
         for terms in camera_models()[model].search.terms:
-            fit = extended(start, views, terms)
+            # A larger set starts from the largest set within it.
+            within = (f for m, t, f in reversed(fits) if m == model and {*t} <= {*terms})
+            fit = extended(next(within, first), views, terms)
             fits.append((model, terms, fit))
             radial = sum(name.startswith("k") for name in terms)
             best_residual = min(_median_residual(f) for _, _, f in fits)
             hopeless = max(options.hopeless_ratio * best_residual, options.hopeless_residual)
             if radial >= options.hopeless_terms and _median_residual(fit) > hopeless:
                 break
-            # a larger set starts from this fit
-            start = fit if "k1" in terms else start
     if not fits:
         return ()
     # Compare all candidates on the same corners, rejected ones included. Each squared residual is
