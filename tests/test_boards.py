@@ -540,6 +540,14 @@ def test_windows_are_no_circles(tmp_path):
     assert caught.value.found == "only 0 of 48 corners are sharp and uncovered"
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 5000), (5000, 1), (2, 3000), (20, 20)])
+@pytest.mark.parametrize("kind", ["charuco", "chessboard", "aruco_grid", "circle_grid"])
+def test_images_of_hardly_any_pixels(tmp_path, kind, size):
+    cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 255, size, np.uint8))
+    with pytest.raises(InputError, match="in none of the images"):
+        detect_boards([tmp_path / "a.png"], board_of(tmp_path, FILES[kind]))
+
+
 def test_images_of_two_sizes(tmp_path, pictures):
     board, paths = pictures["charuco"]
     odd = images(tmp_path, board, 1, (640, 480), start=7)

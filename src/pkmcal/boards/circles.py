@@ -99,6 +99,8 @@ def _attempts(image: Integers, board: Board, options: CircleOptions) -> Iterator
     settings: Any = cv2.SimpleBlobDetector.Params()
     settings.minArea = options.least_area
     settings.maxArea = image.size / len(board.points)
+    if settings.maxArea < settings.minArea:
+        return  # the image has no room for the grid
     settings.minDistBetweenBlobs = float(np.sqrt(options.least_area))
     blobs: Any = cv2.SimpleBlobDetector.create(settings)
     for picture in (image, 255 - image):

@@ -82,7 +82,9 @@ def narrowed(image: Integers, width: int) -> tuple[Any, float]:
     scale = width / image.shape[1]
     if scale >= 1:
         return image, 1.0
-    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
+    # a strip keeps one row; both scales are equal otherwise
+    size = (width, 1) if scale * image.shape[0] < 1 else None
+    return cv2.resize(image, size, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
 
 
 def upright_turns(path: Path, image_size: tuple[int, int]) -> int:
