@@ -24,6 +24,10 @@ BOARDS = {
     "chessboard": {"type": "chessboard", "corners": [7, 6], "square": 0.02},
     "aruco_grid": {"type": "aruco_grid", "markers": [4, 5], "marker": 0.03, "gap": 0.008,
                    "dictionary": "DICT_4X4_50"},
+    "aprilgrid": {"type": "aruco_grid", "markers": [4, 5], "marker": 0.03, "gap": 0.009,
+                  "dictionary": "DICT_APRILTAG_36h11", "border": 2, "leftward": True},
+    "circles": {"type": "circle_grid", "circles": [6, 7], "spacing": 0.025},
+    "asymmetric": {"type": "circle_grid", "circles": [4, 9], "spacing": 0.02, "asymmetric": True},
 }  # fmt: skip
 
 
@@ -37,11 +41,27 @@ def content_of(pdf):
 def rectangles(text):
     """(n, 4) x0, y0, x1, y1 in mm from the page's lower left corner."""
     values = re.findall(r"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re", text)
+    values = values or [[0.0] * 4]
     x, y, w, h = np.array(values, dtype=float).T * POINT
     return np.stack([x, y, x + w, y + h], axis=-1)
 
 
-def rasterised(size, boxes):
+def discs(text):
+    """(n, 3) middle and radius in mm, of circles of four curves from their rightmost point on."""
+    paths = re.findall(r"^([\d.]+ [\d.]+) m ((?:[\d. ]+ c ){4})h$", text, re.MULTILINE)
+    out = []
+    for start, curves in paths:
+        ends = [curve.split()[-2:] for curve in curves.split("c")[:4]]
+        points = np.array([start.split(), *ends], dtype=float) * POINT
+        assert np.allclose(points[0], points[4], atol=1e-3)
+        middle = points[:4].mean(axis=0)
+        radii = np.linalg.norm(points - middle, axis=1)
+        assert np.allclose(radii, radii[0], atol=1e-3)
+        out.append([*middle, radii[0]])
+    return np.array(out).reshape(-1, 3)
+
+
+def rasterised(size, boxes, circles):
     """The page as a printer of DPI dots an inch sees it, top row first; partly black by area."""
     scale = 4
     dots = np.round(size / 25.4 * DPI).astype(int) * scale
@@ -49,6 +69,11 @@ def rasterised(size, boxes):
     at = np.round(boxes / 25.4 * DPI * scale).astype(int)
     for x0, y0, x1, y1 in at:
         fine[dots[1] - y1 : dots[1] - y0, x0:x1] = 0
+    for x0, y0, radius in circles / 25.4 * DPI * scale:
+        low = int(x0 - radius), int(dots[1] - y0 - radius)
+        part = fine[low[1] :, low[0] :][: int(2 * radius) + 2, : int(2 * radius) + 2]
+        y, x = np.mgrid[: part.shape[0], : part.shape[1]] + 0.5
+        part[np.hypot(x + low[0] - x0, y + low[1] - (dots[1] - y0)) < radius] = 0
     rows, columns = dots[1] // scale, dots[0] // scale
     return fine.reshape(rows, scale, columns, scale).mean(axis=(1, 3)).astype(np.uint8)
 
@@ -58,7 +83,7 @@ def test_the_printed_board_is_found_with_its_points_in_true_size(kind, tmp_path)
     board = board_from_fields(BOARDS[kind])
     pdf, _ = sheet_pdf(board)
     size, text = content_of(pdf)
-    image = rasterised(size, rectangles(text))
+    image = rasterised(size, rectangles(text), discs(text))
     cv2.imwrite(str(tmp_path / "page.png"), cv2.GaussianBlur(image, (0, 0), 1.0))
     (visible,) = detect_boards([tmp_path / "page.png"], board)
     assert visible.success, visible.reason

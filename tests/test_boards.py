@@ -9,9 +9,16 @@ import pytest
 from pkmcal.boards.board import chessboard, load_board
 from pkmcal.boards.circles import circle_centres, find_circles
 from pkmcal.boards.detect import detect_boards
-from pkmcal.boards.find import Markers, detect_board, detect_markers, dictionary
+from pkmcal.boards.find import (
+    BOARD_DETECTION_OPTIONS,
+    Markers,
+    detect_board,
+    detect_markers,
+    dictionary,
+)
 from pkmcal.boards.layout import another_grid, marker_layout
 from pkmcal.boards.prints import Print
+from pkmcal.boards.saddles import is_large_enough, largest_block
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.files import yaml_text
@@ -367,11 +374,15 @@ def test_a_circles_centre_is_not_its_images_centroid(tmp_path):
     assert np.sqrt(np.mean((centres - truth) ** 2)) < 0.02
 
 
-@pytest.mark.parametrize("kind", ["circle_grid", "kalibr_aprilgrid"])
-def test_boards_of_other_programs_are_not_printed(tmp_path, kind):
-    with pytest.raises(InputError) as caught:
-        Print.of(board_of(tmp_path, FILES[kind]))
-    assert caught.value.what == "boards of this kind are not printed"
+def test_a_printed_aprilgrid_is_kalibrs(tmp_path):
+    """Tags, their order and the black squares, as drawn from Kalibr's rules."""
+    board = board_of(tmp_path, FILES["kalibr_aprilgrid"])
+    image, first, scale = texture(board)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    dark = Print.of(board).dark_at(
+        (x.ravel() + 0.5 - first) / scale, (y.ravel() + 0.5 - first) / scale
+    )
+    assert np.mean((image < 100) == dark.reshape(image.shape)) > 0.999
 
 
 def test_grids_that_look_the_same_turned_by_half(tmp_path):
@@ -504,6 +515,38 @@ def test_no_board_anywhere(tmp_path, pictures):
     with pytest.raises(InputError, match="in none of the images") as caught:
         detect_boards(paths, pictures["charuco"][0])
     assert caught.value.found == "none of the board's markers"
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_blocks_of_corners_separate_boards_from_textures(tmp_path, camera):
+    """Every inner corner of a chessboard counts; of a texture as rough, hardly any point."""
+    board = board_of(tmp_path, FILES["chessboard"])
+    image = render(CAMERAS[camera], view(board, (0.3, -0.2, 0.1), (0.0, 0.0), 0.4), board)
+    columns, rows = board.counts
+    assert largest_block(image) >= 0.75 * (columns - 2) * (rows - 2)
+    texture = cv2.GaussianBlur(np.random.default_rng(0).normal(128, 40, image.shape), (0, 0), 1.5)
+    block = largest_block(cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8))
+    assert not is_large_enough(block, board.counts, BOARD_DETECTION_OPTIONS.visible_share)
+
+
+def test_windows_are_no_circles(tmp_path):
+    """Dark squares on the places of circles."""
+    image = np.full((480, 640), 200, np.uint8)
+    for row, column in np.ndindex(6, 8):
+        y, x = 60 + 60 * row, 80 + 60 * column
+        image[y - 17 : y + 17, x - 17 : x + 17] = 40
+    cv2.imwrite(str(tmp_path / "windows.png"), image)
+    with pytest.raises(InputError) as caught:
+        detect_boards([tmp_path / "windows.png"], board_of(tmp_path, FILES["circle_grid"]))
+    assert caught.value.found == "only 0 of 48 corners are sharp and uncovered"
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5000), (5000, 1), (2, 3000), (20, 20)])
+@pytest.mark.parametrize("kind", ["charuco", "chessboard", "aruco_grid", "circle_grid"])
+def test_images_of_hardly_any_pixels(tmp_path, kind, size):
+    cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 255, size, np.uint8))
+    with pytest.raises(InputError, match="in none of the images"):
+        detect_boards([tmp_path / "a.png"], board_of(tmp_path, FILES[kind]))
 
 
 def test_images_of_two_sizes(tmp_path, pictures):

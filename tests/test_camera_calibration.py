@@ -42,6 +42,7 @@ from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import Document
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
+from pkmcal.judge.camera_difference import camera_difference
 from pkmcal.report.camera import outcome_of
 from pkmcal.web.report_page import report_page
 from test_boards import CAMERAS, render, view
@@ -290,6 +291,31 @@ def test_opencv_agrees():
     k, d = np.asarray(k), np.asarray(d).ravel()
     np.testing.assert_allclose(ours[:4], [k[0, 0], k[1, 1], k[0, 2], k[1, 2]], rtol=2e-4)
     np.testing.assert_allclose(ours[4:8], d[:4], atol=3e-3)
+
+
+def test_a_tilted_sensor():
+    """Angles and projection, against cv2.calibrateCamera's; without a tilt none is estimated."""
+    true = TRUE["pinhole"].parameters
+    tilt = camera_of("rational", *true, 0, 0, 0, 0, 0, 0, 0, 0.05, -0.08)
+    poses = poses_for(tilt, 14, 31)
+    value = detections(tilt, poses, 31)
+    ours = calibrate_camera(value, BOARD, options=alone("pinhole", "rational"))
+    assert {"tau.x", "tau.y"} <= set(ours.terms)
+    off = ours.camera.parameters - tilt.parameters
+    assert np.abs(off[-2:] / ours.sigma[-2:]).max() < 3
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 300, 1e-12)
+    _, k, d, *_ = cv2.calibrateCamera(
+        [BOARD.points.astype(np.float32)] * len(value),
+        [one.pixels.astype(np.float32).reshape(-1, 1, 2) for one in value],
+        SIZE, None, None, flags=cv2.CALIB_TILTED_MODEL, criteria=until,
+    )  # fmt: skip
+    theirs = camera_of("rational", *np.asarray(k)[[0, 1, 0, 1], [0, 1, 2, 2]], *np.ravel(d))
+    mine, opencv = (np.nanmedian(camera_difference(tilt, c).lengths) for c in (ours.camera, theirs))
+    assert mine < 1.2 * opencv
+    flat = detections(TRUE["pinhole"], poses, 31)
+    assert calibrate_camera(flat, BOARD, options=alone("pinhole", "rational")).camera.model == (
+        "pinhole"
+    )
 
 
 def misnumbered(value, columns=8):

@@ -156,11 +156,12 @@ def test_files_as_others_write_them(tmp_path):
          "or lens model is not supported; found field_of_view, expected plumb_bob, "
          "rational_polynomial, equidistant and fisheye. Calibrate again from images of a board: "
          "pkmcal camera."),
-        (ROS, "0.3]", "0.3, 0.1]", "c.yaml, line 4, camera_matrix: the camera has distortion "
-         "beyond the model's 5 terms; found 6 terms."),
-        (ROS, "[500, 0, 320, 0, 501,", "[5, 0, 320, 0, 5,", "c.yaml, line 4, camera_matrix: the "
-         "camera has a focal length that looks like millimetres; it is wanted in pixels; found 5 "
-         "at a width of 640."),
+        (ROS, "0.3]", "0.3, 0.1]", "c.yaml, line 6, distortion_coefficients: OpenCV has no lens "
+         "model with this number of distortion coefficients; found 6 terms, expected 0, 4, 5, 8, "
+         "12 and 14."),
+        (ROS, "[500, 0, 320, 0, 501,", "[5, 0, 320, 0, 5,", "c.yaml, line 4, camera_matrix, "
+         "focal: the focal length [5.0, 5.0] looks like millimetres; it is wanted in pixels, which "
+         "is millimetres divided by the size of a pixel in mm."),
         (ROS, "image_width: 640\n", "", "c.yaml, image_width: this is missing."),
         (ROS, "camera_matrix", "matrix", "c.yaml, model: the camera's model is missing; expected "
          "double_sphere or extended_unified or fisheye or pinhole or rational or unified. "
@@ -179,7 +180,7 @@ def test_faults_of_others_files(tmp_path, text, old, new, sentence):
 
 def test_kalibr_faults(tmp_path):
     one = KALIBR.partition("cam1")[0]
-    with pytest.raises(InputError, match="negative xi"):
+    with pytest.raises(InputError, match=r"xi: this value cannot be used; found -1\.2"):
         read_text(tmp_path, one.replace("[1.2,", "[-1.2,"))
     with pytest.raises(InputError) as error:
         read_text(tmp_path, one.replace("radtan", "fov"))
@@ -211,6 +212,22 @@ def test_what_a_format_cannot_hold_is_refused():
         foreign_text(replace(camera, parameters=parameters), "a.yaml", "kalibr")
     with pytest.raises(InputError, match="no such format of camera files; found rso"):
         foreign_text(camera, "a.yaml", "rso")
+
+
+def test_matrices_of_ros_that_contradict(tmp_path):
+    """Without distortion and rectification both matrices hold the same numbers."""
+    text = ROS.partition("distortion_coefficients")[0] + (
+        "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
+        "rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\n"
+        "projection_matrix: {rows: 3, cols: 4,"
+        " data: [500, 0, 320, 0, 0, 501, 240, 0, 0, 0, 1, 0]}\n"
+    )
+    assert read_text(tmp_path, text).focal[0] == 500
+    with pytest.raises(InputError, match="contradict each other"):
+        read_text(tmp_path, text.replace("data: [500, 0, 320, 0, 0", "data: [250, 0, 160, 0, 0"))
+    # A calibrated lens has another matrix for rectified images.
+    lens = text.replace("data: [0, 0, 0, 0, 0]", "data: [0.1, 0, 0, 0, 0]")
+    read_text(tmp_path, lens.replace("data: [500, 0, 320, 0, 0", "data: [480, 0, 310, 0, 0"))
 
 
 @pytest.mark.parametrize(
@@ -525,3 +542,46 @@ def test_opencv_omnidir_agrees():
     points = half_field(camera, 2)
     theirs = cv2.omnidir.projectPoints(points[:, None], zero, zero, matrix, xi, np.array([k]))[0]
     np.testing.assert_allclose(camera.project(points), theirs.reshape(-1, 2), atol=1e-9)
+
+
+EVERY_FORM = {
+    "c.yaml": ROS,
+    "kalibr.yaml": KALIBR[: KALIBR.index("cam1")],
+    "opencv.yaml": OPENCV,
+    "c.cameramodel": MRCAL,
+    "c.txt": "1 PINHOLE 640 480 500 501 320.5 240.5\n",
+    "c.xml": VISP.replace("1089.9", "500").replace("1090.1", "501").replace("326.1", "320"),
+    "own.yaml": "model: pinhole\nimage_size: [640, 480]\nfocal: [500, 501]\ncenter: [320, 240]\n",
+}
+"""The same camera in every format."""
+CONTRADICTIONS = {
+    "centre": ("320", "1280"),
+    "millimetres": ("500", "5"),
+    "focal length": ("500", "500000"),
+    "aspect": ("501", "1600"),
+    "no width": ("640", "0"),
+    "negative width": ("640", "-640"),
+    "part of a pixel": ("640", "640.5"),
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+@pytest.mark.parametrize("file", EVERY_FORM)
+def test_numbers_that_no_camera_has(tmp_path, file, name):
+    """Whatever program wrote them."""
+    path, (old, new) = tmp_path / file, CONTRADICTIONS[name]
+    path.write_text(EVERY_FORM[file])
+    assert load_camera(path).image_size == (640, 480)
+    assert old in EVERY_FORM[file]
+    path.write_text(EVERY_FORM[file].replace(old, new))
+    with pytest.raises(InputError) as caught:
+        load_camera(path)
+    assert caught.value.where
+
+
+def test_a_transposed_matrix(tmp_path):
+    """The centre is in the last row, as in Matlab."""
+    with pytest.raises(InputError, match="row by row"):
+        read_text(
+            tmp_path, ROS.replace("0, 320, 0, 501, 240, 0, 0, 1", "0, 0, 0, 501, 0, 320, 240, 1")
+        )

@@ -537,8 +537,8 @@ def test_the_parameters_of_a_file_stand_in_their_order(tmp_path):
             "wanted in pixels, which is millimetres divided by the size of a pixel in mm.",
         ),
         (
-            "center: [319.5, 239.5]",
-            "center: [3.2e+10, 239.5]",
+            "center: [319.5, 239.5]\ndistortion: [-0.2, 0.1]",
+            "center: [0, 0]\ndistortion: [-90, 0]",
             "a.yaml: the camera has no ray in the middle of its image; found image_size "
             "[640, 480], and lens numbers by which no ray of light ends there, expected focal, "
             "center and distortion of images of this size.",

@@ -18,6 +18,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board
 from pkmcal.levels import CONTRADICTION_SIGMAS
+from pkmcal.observe.images import narrowed
 
 LEAST_WINDOW_RADIUS = 2.5
 """Smallest radius, px, of what is measured on a board: a smaller window holds too few pixels for
@@ -28,8 +29,9 @@ the seven unknowns of a corner."""
 class CircleOptions:
     """Constants of the detection of circles."""
 
-    # least area of a circle, px: that of the smallest window of a corner, which a smaller one's
-    # blur fills
+    # width, px, to which larger images are reduced to search for the grid
+    searched_width: int = 1600
+    # least area of a circle, px, there: that of the smallest window of a corner
     least_area: float = pi * LEAST_WINDOW_RADIUS**2
     # neighbours, the circle included, of which the homography of a circle is fitted
     neighbours: int = 9
@@ -41,6 +43,9 @@ class CircleOptions:
     ring: float = 0.85
     # least difference between circle and paper, in standard deviations of the paper
     least_contrast: float = CONTRADICTION_SIGMAS
+    # largest fourth harmonic of a circle's outline, weighted by the fourth power of the radius; a
+    # square has 0.43 (derived)
+    most_angular: float = 0.25
 
 
 CIRCLE_OPTIONS = CircleOptions()
@@ -51,8 +56,9 @@ def find_circles(
 ) -> Array | None:
     """Rough centres (N, 2) px in the board's order; None if the grid is not detected."""
     columns, rows = board.counts
+    image, scale = narrowed(image, options.searched_width)
     for centres in _attempts(image, board, options):
-        grid = centres.reshape(rows, columns, 2)
+        grid = ((centres + 0.5) / scale - 0.5).reshape(rows, columns, 2)
         right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
         if right[0] * down[1] - right[1] * down[0] > 0:
             return grid.reshape(-1, 2)
@@ -70,10 +76,11 @@ def circle_centres(
     order = np.argsort(gap, axis=1, kind="stable")[:, : options.neighbours]
     half = float(np.min(gap + np.where(np.eye(len(xy)) > 0, np.inf, 0.0))) / 2
     centres = start.astype(float)
+    grey = image.astype(np.float32)
     good, sigma = np.zeros(len(xy), dtype=bool), np.zeros(len(xy))
     for _ in range(options.passes):
         measured = [
-            _centre(image, xy[i], _homography(xy[near], centres[near]), half, options)
+            _centre(grey, xy[i], _homography(xy[near], centres[near]), half, options)
             for i, near in enumerate(order)
         ]
         good = np.array([one is not None for one in measured])
@@ -96,6 +103,8 @@ def _attempts(image: Integers, board: Board, options: CircleOptions) -> Iterator
     settings: Any = cv2.SimpleBlobDetector.Params()
     settings.minArea = options.least_area
     settings.maxArea = image.size / len(board.points)
+    if settings.maxArea < settings.minArea:
+        return  # the image has no room for the grid
     settings.minDistBetweenBlobs = float(np.sqrt(options.least_area))
     blobs: Any = cv2.SimpleBlobDetector.create(settings)
     for picture in (image, 255 - image):
@@ -116,11 +125,12 @@ def _homography(xy: Array, pixels: Array) -> Array:
 
 
 def _centre(
-    image: Integers, xy: Array, H: Array, half: float, options: CircleOptions
+    image: Array, xy: Array, H: Array, half: float, options: CircleOptions
 ) -> tuple[Array, float] | None:
-    """Centre (2,) px and its standard deviation; None where no circle stands out from the paper.
+    """Centre (2,) px and its standard deviation; None where nothing round stands out.
 
-    xy : (2,) m, place on the board. half : half the distance to the nearest circle, m.
+    image : grey levels, float32. xy : (2,) m, place on the board. half : half the distance to the
+        nearest circle, m.
     """
     import cv2
 
@@ -132,7 +142,7 @@ def _centre(
     if not np.isfinite(pixels).all() or (pixels < 0).any() or (pixels > last).any():
         return None
     x, y = np.moveaxis(pixels.astype(np.float32), -1, 0)
-    grey = np.asarray(cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR))
+    grey = np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR))
     paper = grey[(radius > options.ring) & (radius <= 1)]
     # bilinear interpolation leaves two thirds of the pixels' standard deviation, on average
     level, noise = float(np.median(paper)), 1.5 * float(np.std(paper))
@@ -141,6 +151,9 @@ def _centre(
         return None
     share = np.where(radius <= 1, (level - grey) / contrast, 0.0)
     total = float(share.sum())
+    quartic = ((offsets[..., 0] + 1j * offsets[..., 1]) / half) ** 4
+    if abs(np.sum(share * quartic)) > options.most_angular * abs(np.sum(share * abs(quartic))):
+        return None  # the corners of a window, a key or a tile
     offset = np.sum(share[..., None] * offsets, axis=(0, 1)) / total
     # White noise of the pixels; their number in a sample cancels.
     spread = float(np.sum(offsets[radius <= 1][:, 0] ** 2))

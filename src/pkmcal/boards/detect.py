@@ -13,7 +13,6 @@ import numpy as np
 
 from pkmcal.arrays import THREADS, Array, Integers
 from pkmcal.boards.board import Board, Detection, board_from_document, chessboard, dictionaries
-from pkmcal.boards.circles import find_circles
 from pkmcal.boards.find import (
     BOARD_DETECTION_OPTIONS,
     BoardDetectionOptions,
@@ -23,7 +22,7 @@ from pkmcal.boards.find import (
     detect_markers,
     dictionary,
     find_chessboard,
-    narrowed,
+    marker_outlines,
 )
 from pkmcal.boards.layout import (
     MARKER_LAYOUT_OPTIONS,
@@ -31,10 +30,11 @@ from pkmcal.boards.layout import (
     another_grid,
     marker_layout,
 )
+from pkmcal.boards.saddles import is_large_enough, largest_block
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.levels import NEARLY_ALL
-from pkmcal.observe.images import decode
+from pkmcal.observe.images import decode, narrowed
 from pkmcal.outcome.progress import Progress, no_progress
 from pkmcal.session.image_files import image_header
 from pkmcal.wording import listed
@@ -53,13 +53,16 @@ class OtherBoardOptions:
     # width in px to which images are reduced to try many sizes of chessboards: a try takes a
     # quarter of a second, and more than one second at full size (measured)
     width: int = 512
-    # width in px to which images are reduced to search for markers of all dictionaries
-    marker_width: int = 1600
+    # share of the corners inside another chessboard of which all neighbours must be seen: all its
+    # corners must be fitted, and a corner not seen costs up to nine
+    visible_share: float = 0.5
     # least relative difference between measured and described markers: corners of markers are
     # located to about half a pixel, a twentieth of the smallest markers used (derived)
     size_difference: float = 0.1
-    # fewest markers for a measurement of their size
+    # fewest markers for a measurement of their size, and for another dictionary
     least_markers: int = 4
+    # most outlines of markers that are compared with all dictionaries, the largest first
+    most_outlines: int = 24
     # detection of boards of other sizes, and layout of the markers of a grid
     detection: BoardDetectionOptions = BOARD_DETECTION_OPTIONS
     layout: MarkerLayoutOptions = MARKER_LAYOUT_OPTIONS
@@ -380,13 +383,16 @@ def _other_chessboard(
         span = range(-options.miscounts, options.miscounts + 1)
         candidates = [(counts[0] + a, counts[1] + b) for a, b in product(span, span)]
     image, _ = narrowed(image, options.width)
+    block = largest_block(image)
     # Largest first: smaller grids are also detected inside larger ones.
     for candidate in sorted(candidates, key=lambda c: -c[0] * c[1]):
         if min(candidate) < 3 or candidate in (counts, counts[::-1]):
             continue
         if not part and all(n <= m for n, m in zip(sorted(candidate), sorted(counts), strict=True)):
             continue
-        if _all_corners(image, candidate, options.detection):
+        if not is_large_enough(block, candidate, options.visible_share):
+            continue
+        if _all_corners(image, candidate, options.detection, block):
             return chessboard(candidate, 1.0).described
     return None
 
@@ -396,17 +402,22 @@ def _other_circles(image: Integers, board: Board, options: OtherBoardOptions) ->
     instead of a chessboard or an asymmetric grid, asymmetric instead of a symmetric grid.
     """
     asymmetric = board.type == "circle_grid" and not board.document["asymmetric"]
-    other = replace(board, type="circle_grid", document={"asymmetric": asymmetric})
-    return (
-        other.described
-        if find_circles(narrowed(image, options.width)[0], other) is not None
-        else None
-    )
+    data = {"type": "circle_grid", "circles": list(board.counts), "spacing": 1.0}
+    other = board_from_document(Document(Path(), "", {**data, "asymmetric": asymmetric}, {}))
+    detection = detect_board(narrowed(image, options.width)[0], other, options=options.detection)
+    return other.described if detection.success else None
 
 
-def _all_corners(image: Integers, counts: tuple[int, int], options: BoardDetectionOptions) -> bool:
-    """Whether a chessboard of these counts is in the image with all corners fitted."""
-    if find_chessboard(image, counts, quick=True, options=options) is None:
+def _all_corners(
+    image: Integers,
+    counts: tuple[int, int],
+    options: BoardDetectionOptions,
+    block: int | None = None,
+) -> bool:
+    """Whether a chessboard of these counts is in the image with all corners fitted; block : the
+    image's `largest_block`, None if it is not known yet.
+    """
+    if find_chessboard(image, counts, quick=True, block=block, options=options) is None:
         return False
     detection = detect_board(image, chessboard(counts, 1.0), options=options)
     return len(detection.ids) == counts[0] * counts[1]
@@ -464,7 +475,10 @@ def _other_markers(image: Integers, mine: str, options: OtherBoardOptions) -> st
     """Description of the dictionary whose markers the image shows, the smallest that contains them;
     None for too few, or if most are of the dictionary ``mine``.
     """
-    image, _ = narrowed(image, options.marker_width)
+    image, _ = narrowed(image, options.detection.searched_width)
+    outlines = marker_outlines(image)
+    if len(outlines) < options.least_markers:
+        return None
     # DICT_4X4_50 is the first 50 markers of DICT_4X4_1000: one search covers the family.
     wanted = [
         n
@@ -473,10 +487,14 @@ def _other_markers(image: Integers, mine: str, options: OtherBoardOptions) -> st
     ]
     # some names differ only in case
     names = list({name.lower(): name for name in wanted}.values())
-    ids = {name: detect_markers(image, dictionary(name)).ids for name in names}
-    best = max(names, key=lambda name: len(ids[name]))
+    # The largest outlines choose the dictionary, which then is searched everywhere.
+    size = np.ptp(outlines, axis=1).min(axis=1)
+    largest = outlines[np.argsort(-size, kind="stable")[: options.most_outlines]]
+    few = _only(image, largest)
+    best = max(names, key=lambda name: len(detect_markers(few, dictionary(name)).ids))
+    ids = {name: detect_markers(image, dictionary(name)).ids for name in {best, mine} & {*names}}
     count = len(ids[best])
-    if count < 4 or (mine in ids and len(ids[mine]) > 0.7 * count):
+    if count < options.least_markers or (mine in ids and len(ids[mine]) > 0.7 * count):
         return None
     if _dictionary_size(best) == NO_SIZE:
         return f"{count} markers of {best}"
@@ -484,6 +502,17 @@ def _other_markers(image: Integers, mine: str, options: OtherBoardOptions) -> st
     sizes = [_dictionary_size(n) for n in dictionaries() if n.rpartition("_")[0] == family]
     size = min(size for size in sizes if size > np.quantile(ids[best], NEARLY_ALL))
     return f"{count} markers of {family}_{size}"
+
+
+def _only(image: Integers, outlines: Array) -> Integers:
+    """Image of white paper but for the surroundings of outlines (k, 4, 2) px."""
+    out = np.full_like(image, 255)
+    low, high = outlines.min(axis=1), outlines.max(axis=1)
+    margin = 0.25 * (high - low)
+    first = np.maximum(np.floor(low - margin), 0).astype(int)
+    for (x, y), (right, bottom) in zip(first, np.ceil(high + margin).astype(int) + 1, strict=True):
+        out[y:bottom, x:right] = image[y:bottom, x:right]
+    return out
 
 
 def _dictionary_size(name: str) -> int:

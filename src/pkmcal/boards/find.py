@@ -23,7 +23,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.circles import LEAST_WINDOW_RADIUS, circle_centres, find_circles
+from pkmcal.boards.saddles import is_large_enough, largest_block
 from pkmcal.levels import NEARLY_ALL
+from pkmcal.observe.images import narrowed
 from pkmcal.solver.marquardt import Damping
 from pkmcal.solver.ranks import column_space
 
@@ -61,15 +63,32 @@ class BoardDetectionOptions:
     whole_share: float = 0.75
     # width, px, from which images are tried at half their size as well
     half_size_from: int = 1000
-    # width, px, to which larger images are reduced to search for a chessboard; one way takes ten
+    # width, px, to which larger images are reduced to search for a chessboard, and for outlines of
+    # markers; one way takes ten
     # seconds on a cluttered image of twelve megapixels (measured)
     searched_width: int = 1600
+    # share of the corners inside a chessboard of which all neighbours must be seen; a corner in
+    # glare, or covered, costs up to nine
+    visible_share: float = 0.2
+    # fewest markers visible of a ChArUco board, six corners of which lie between six, and of a grid
+    least_charuco_markers: int = 4
+    least_grid_markers: int = 2
+    # what may be a marker: the border's middle, as a share of the marker's side; its share that is
+    # dark; the least share inside that is light, and that is dark; grey levels between them
+    border_place: float = 0.055
+    dark_border: float = 0.7
+    least_light: float = 0.1
+    marker_contrast: float = 10.0
     # share of a square by which a corner may lie off the middle of its two neighbours' line
     bend: float = 0.35
 
 
 BOARD_DETECTION_OPTIONS = BoardDetectionOptions()
 
+
+DETECTION_ORDER = ((False, True), (False, False), (True, True), (True, False))
+"""Runs of the detector of markers: in the mirrored image or not, and by one threshold alone, five
+times as fast and enough where it shows the whole board, or by all."""
 
 Raw = tuple[Integers, Array]
 """Corner ids (n,) and pixels (n, 2) as a detector gives them."""
@@ -93,7 +112,7 @@ def detect_board(
     elif board.type == "circle_grid":
         raw, mirrored, why = _circles(image, board)
     else:
-        raw, mirrored, why = _marker_grid(image, board)
+        raw, mirrored, why = _marker_grid(image, board, options)
     size = (image.shape[1], image.shape[0])
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     if len(raw[0]) < options.least_corners:
@@ -121,19 +140,18 @@ def _charuco(
 ) -> tuple[Raw, bool, str]:
     best: Raw = (np.zeros(0, dtype=int), np.zeros((0, 2)))
     markers = 0
-    for mirrored in (False, True):
+    for mirrored, quick in DETECTION_ORDER:
         picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-        # By one threshold alone five times as fast: enough where it shows the whole board.
-        for detector, enough in (
-            (charuco_detector(board.document, quick=True), len(board.points)),
-            (charuco_detector(board.document), options.least_corners),
+        corners, ids, _, marker_ids = charuco_detector(board.document, quick).detectBoard(picture)
+        markers = max(markers, _length(marker_ids))
+        count = _raw(corners, ids, image.shape[1], mirrored)
+        if len(count[0]) >= (len(board.points) if quick else options.least_corners):
+            return count, mirrored, ""
+        best = max(best, count, key=lambda raw: len(raw[0]))
+        if (mirrored, quick) == DETECTION_ORDER[0] and _few_outlines(
+            image, options.least_charuco_markers, options
         ):
-            corners, ids, _, marker_ids = detector.detectBoard(picture)
-            markers = max(markers, _length(marker_ids))
-            count = _raw(corners, ids, image.shape[1], mirrored)
-            if len(count[0]) >= enough:
-                return count, mirrored, ""
-            best = max(best, count, key=lambda raw: len(raw[0]))
+            break
     why = f"{markers} of the board's markers and {len(best[0])} corners are detected"
     return best, False, why if markers else "none of the board's markers"
 
@@ -213,18 +231,67 @@ def detect_markers(image: Integers, words: Any, quick: bool = False, border: int
     return Markers(np.asarray(ids).reshape(-1).astype(int), corners)
 
 
-def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
+def marker_outlines(
+    image: Integers, options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS
+) -> Array:
+    """Outlines (k, 4, 2) px of what may be markers of any dictionary: quadrilaterals with a dark
+    border and with light and dark inside.
+
+    A detector compares each quadrilateral with all markers of its dictionary, which takes most of
+    its time; photographs without a board have hundreds of quadrilaterals.
+    """
+    import cv2
+
+    # The smallest dictionary: what is none of its markers is returned as well.
+    detector = cv2.aruco.ArucoDetector(dictionary("DICT_APRILTAG_16h5"), _thresholds(False))
+    detected, _, rejected = detector.detectMarkers(image)
+    outlines = np.array([*detected, *rejected], dtype=float).reshape(-1, 4, 2)
+    # One ring of samples in the middle of the narrowest border, and a lattice of them inside.
+    side, edge = np.linspace(0.08, 0.92, 11), options.border_place
+    ring = [[(s, e), (e, s)] for s in side for e in (edge, 1 - edge)]
+    lattice = np.stack(np.meshgrid(*[np.linspace(0.2, 0.8, 13)] * 2), axis=-1)
+    u = np.concatenate([np.reshape(ring, (-1, 2)), lattice.reshape(-1, 2)])
+    x, y = u[:, 0], u[:, 1]
+    corners = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=-1)
+    places = np.rint(corners @ outlines).astype(int)
+    column, row = np.clip(places, 0, np.array(image.shape[::-1]) - 1).transpose(2, 0, 1)
+    grey = image[row, column].astype(float)
+    border, inside = grey[:, : 4 * len(side)], grey[:, 4 * len(side) :]
+    dark = np.median(border, axis=1)
+    light = np.quantile(inside, 1 - options.least_light / 2, axis=1)
+    middle = (dark + light)[:, None] / 2
+    share = np.mean(inside > middle, axis=1)
+    marker_like = (
+        (light - dark > options.marker_contrast)
+        & (np.mean(border < middle, axis=1) >= options.dark_border)
+        & (share >= options.least_light)
+        & (share <= 1 - options.least_light)
+    )
+    return outlines[marker_like]
+
+
+def _few_outlines(image: Integers, least: int, options: BoardDetectionOptions) -> bool:
+    """Whether an image has too few outlines of markers for a board with `least` markers visible."""
+    return len(marker_outlines(narrowed(image, options.searched_width)[0], options)) < least
+
+
+def _marker_grid(
+    image: Integers, board: Board, options: BoardDetectionOptions
+) -> tuple[Raw, bool, str]:
     data = board.document
     count = board.counts[0] * board.counts[1]
     words = dictionary(data["dictionary"], data.get("first_id", 0), count)
-    for mirrored in (False, True):
+    for mirrored, quick in DETECTION_ORDER:
         picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-        for quick, enough in ((True, count), (False, 2)):
-            ids, corners = detect_markers(picture, words, quick, data.get("border", 1))
-            once = ~np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
-            if once.sum() >= enough:
-                values = (4 * ids[once, None] + np.arange(4)).reshape(-1)
-                return _raw(corners[once], values, image.shape[1], mirrored), mirrored, ""
+        ids, corners = detect_markers(picture, words, quick, data.get("border", 1))
+        once = ~np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
+        if once.sum() >= (count if quick else options.least_grid_markers):
+            values = (4 * ids[once, None] + np.arange(4)).reshape(-1)
+            return _raw(corners[once], values, image.shape[1], mirrored), mirrored, ""
+        if (mirrored, quick) == DETECTION_ORDER[0] and _few_outlines(
+            image, options.least_grid_markers, options
+        ):
+            break
     return _raw([], [], 0, False), False, "fewer than two of the board's markers are detected"
 
 
@@ -249,12 +316,18 @@ def find_chessboard(
     image: Integers,
     counts: tuple[int, int],
     quick: bool = False,
+    block: int | None = None,
     options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS,
 ) -> Array | None:
     """Corners (rows * columns, 2) px in the board's order, None where not found.
 
-    quick : the first way only, for trying many counts.
+    quick : the first way only, for trying many counts. block : the image's `largest_block`, None if
+        it is not known yet.
     """
+    if block is None:
+        block = largest_block(narrowed(image, options.searched_width)[0])
+    if not is_large_enough(block, counts, options.visible_share):
+        return None
     for pixels in _attempts(image, counts, quick, options):
         grid = pixels.reshape(counts[1], counts[0], 2)
         if _is_grid(grid, options):
@@ -298,16 +371,6 @@ def _pictures(
     if image.shape[1] > options.half_size_from:
         yield cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 0.5 * scale
     yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0 * scale
-
-
-def narrowed(image: Integers, width: int) -> tuple[Any, float]:
-    """Image reduced to a width in px at most, and its scale, 1 for a narrower image."""
-    import cv2
-
-    scale = width / image.shape[1]
-    if scale >= 1:
-        return image, 1.0
-    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
 
 
 def _is_grid(grid: Array, options: BoardDetectionOptions) -> bool:

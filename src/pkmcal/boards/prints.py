@@ -1,7 +1,8 @@
-"""Printed pattern of a board: its black cells down to single modules, and a PDF page with them.
+"""Printed pattern of a board: its black cells down to single modules, or its circles, and a PDF
+page with them.
 
-The page consists of plain rectangles in true size, which printers reproduce to a tenth of a
-millimetre unless "fit to page" is active; rulers of known length beside the board reveal this.
+The page consists of plain rectangles and circles in true size, which printers reproduce to a tenth
+of a millimetre unless "fit to page" is active; rulers of known length beside the board reveal this.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import re
 import textwrap
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any
 
@@ -29,6 +30,9 @@ PAPER_SIZES = {
     "tabloid": (0.2794, 0.4318), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189),
 }  # fmt: skip
 """Width and height in portrait format, m."""
+
+CIRCLE_RADIUS = 1 / 3
+"""Radius of printed circles, in units of the grid's spacing."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +68,13 @@ SHEET = SheetOptions()
 @dataclass(frozen=True)
 class Print:
     """Printed pattern: cells with edges x (nx + 1,) and y (ny + 1,), m, board frame; dark :
-    (ny, nx).
+    (ny, nx); circles : (k, 3), x, y and radius of black circles, m.
     """
 
     x: Array
     y: Array
     dark: Booleans
+    circles: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def of(cls, board: Board) -> Print:
@@ -80,21 +85,18 @@ class Print:
             i, j = np.mgrid[:rows, :columns]
             edges = [data["square"] * (np.arange(n + 1) - 1.0) for n in (columns, rows)]
             return cls(edges[0], edges[1], (i + j) % 2 == 0)
-        if board.type == "circle_grid" or data.get("border", 1) > 1:
-            raise InputError(
-                "boards of this kind are not printed",
-                found=board.described,
-                expected="a ChArUco board, a chessboard or a grid of markers with a border of one"
-                " module",
-                next_step="Print it with the program that it is from",
-            )
+        if board.type == "circle_grid":
+            return _circles(board)
         return _charuco(data) if board.type == "charuco" else _markers(data)
 
     def dark_at(self, x: Array, y: Array) -> Booleans:
         """Whether points (n,) of the board's plane are black; white outside the pattern."""
         i, j = np.searchsorted(self.y, y) - 1, np.searchsorted(self.x, x) - 1
         inside = (i >= 0) & (j >= 0) & (i < len(self.y) - 1) & (j < len(self.x) - 1)
-        return self.dark[i * inside, j * inside] & inside
+        dark = self.dark[i * inside, j * inside] & inside
+        for circle in self.circles:
+            dark |= np.hypot(x - circle[0], y - circle[1]) < circle[2]
+        return dark
 
 
 def _charuco(data: dict[str, Any]) -> Print:
@@ -120,26 +122,48 @@ def _charuco(data: dict[str, Any]) -> Print:
 
 
 def _markers(data: dict[str, Any]) -> Print:
-    """Pattern of a grid of markers."""
+    """Pattern of a grid of markers; Kalibr's also has black squares between the markers' corners,
+    and around the grid.
+    """
     columns, rows = data["markers"]
-    bits = marker_bits(data["dictionary"]) + 2
+    border, kalibr = data.get("border", 1), data.get("leftward", False)
+    bits = marker_bits(data["dictionary"]) + 2 * border
     cells = data["marker"] * np.arange(bits + 1) / bits
     dark = np.zeros((rows, bits + 1, columns, bits + 1), dtype=bool)
+    dark[:, -1, :, -1] = kalibr
     for k, (i, j) in enumerate(np.ndindex(rows, columns)):
-        dark[i, :-1, j, :-1] = _modules(data["dictionary"], data.get("first_id", 0) + k)
+        column = columns - 1 - j if kalibr else j
+        number = data.get("first_id", 0) + k
+        dark[i, :-1, column, :-1] = _modules(data["dictionary"], number, border)
     step = data["marker"] + data["gap"]
     x, y = (
         np.append((np.arange(n)[:, None] * step + cells).ravel(), n * step) for n in (columns, rows)
     )
-    return Print(x, y, dark.reshape(rows * (bits + 1), -1))
+    cells_dark = dark.reshape(rows * (bits + 1), -1)
+    if not kalibr:
+        return Print(x, y, cells_dark)
+    # The squares before the first row and the first column are those behind the last.
+    around = np.pad(cells_dark, ((1, 0), (1, 0)), mode="wrap")
+    return Print(np.append(-data["gap"], x), np.append(-data["gap"], y), around)
 
 
-def _modules(name: str, number: int) -> Booleans:
-    """Modules of a marker with its black border, (bits + 2, bits + 2)."""
+def _circles(board: Board) -> Print:
+    """Pattern of a grid of circles."""
+    spacing = board.document["spacing"]
+    low, high = board.points[:, :2].min(axis=0) - spacing, board.points[:, :2].max(axis=0) + spacing
+    radius = np.full((len(board.points), 1), CIRCLE_RADIUS * spacing)
+    circles = np.concatenate([board.points[:, :2], radius], axis=1)
+    edges = np.stack([low, high])
+    return Print(edges[:, 0], edges[:, 1], np.zeros((1, 1), dtype=bool), circles)
+
+
+def _modules(name: str, number: int, border: int = 1) -> Booleans:
+    """Modules of a marker with its black border of `border` modules, (bits + 2 border,) * 2."""
     import cv2
 
-    image = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
-    return np.asarray(image) < 128
+    bits = marker_bits(name)
+    image = cv2.aruco.generateImageMarker(dictionary(name), number, bits + 2)
+    return np.pad(np.asarray(image)[1:-1, 1:-1] < 128, border, constant_values=True)
 
 
 def sheet_pdf(
@@ -174,6 +198,10 @@ def sheet_pdf(
     rectangles = [
         f"{on_page(x0, y1)} {(x1 - x0) / PDF_POINT:.4f} {(y1 - y0) / PDF_POINT:.4f} re"
         for x0, y0, x1, y1 in _rectangles(printed, corner)
+    ]
+    discs = [
+        _disc(corner + circle[:2] - [printed.x[0], printed.y[0]], float(circle[2]), on_page)
+        for circle in printed.circles
     ]
     ruler = next((one for one in sheet.rulers if one <= size.min()), sheet.rulers[-1])
     across = np.array([low[0], low[1] + sheet.ruler])
@@ -213,7 +241,7 @@ def sheet_pdf(
     wrapped = [line for one in captions for line in textwrap.wrap(one, room)]
     letters.append(lettering(start, low[1] + sheet.text, sheet.text_points, *wrapped))
     # One path for all rectangles: antialiasing viewers draw seams between separate ones.
-    content = "\n".join(["0 g", *rectangles, "f", "0.4 w", *lines, "S", *letters])
+    content = "\n".join(["0 g", *rectangles, *discs, "f", "0.4 w", *lines, "S", *letters])
     return _document(page / PDF_POINT, content), name
 
 
@@ -259,6 +287,19 @@ def _rectangles(printed: Print, corner: Array) -> Iterator[tuple[float, float, f
         yield x[start], y[row], x[stop], y[row + 1]
 
 
+def _disc(middle: Array, radius: float, on_page: Any) -> str:
+    """Circle of four Bezier curves, to 0.03 % of its radius, as PDF operators."""
+    quarter = 4 / 3 * np.tan(np.pi / 8)
+    out = [f"{on_page(middle[0] + radius, middle[1])} m"]
+    for k in range(4):
+        (c, s), (d, e) = np.rint([[np.cos(a), np.sin(a)] for a in np.pi / 2 * np.array([k, k + 1])])
+        points = np.array(
+            [[c - quarter * s, s + quarter * c], [d + quarter * e, e - quarter * d], [d, e]]
+        )
+        out.append(" ".join(on_page(*(middle + radius * p)) for p in points) + " c")
+    return " ".join([*out, "h"])
+
+
 def _ruler(start: Array, along: Array, on_page: Any) -> list[str]:
     """Line with ticks at both ends and each tenth, as PDF operators."""
     across = np.array([along[1], -along[0]]) / np.abs(along).max()
@@ -287,7 +328,9 @@ def _description(board: Board) -> str:
     """Description of the board for the printed page."""
     data = board.document
     lengths = [
-        f"{key} {1e3 * data[key]:.6g} mm" for key in ("square", "marker", "gap") if key in data
+        f"{key} {1e3 * data[key]:.6g} mm"
+        for key in ("square", "marker", "gap", "spacing")
+        if key in data
     ]
     lettering = [data["dictionary"]] if "dictionary" in data else []
     return f"{board.described}, {', '.join(lengths + lettering)}"

@@ -281,14 +281,14 @@ def camera_candidates(
     """
     fits: list[tuple[str, tuple[str, ...], CameraFit]] = []
     for model in sorted(models, key=CALIBRATED_MODELS.index):
-        start = first_fit(model, views, image_size, options=options)
-        if start is None:
+        first = first_fit(model, views, image_size, options=options)
+        if first is None:
             continue
         for terms in camera_models()[model].search.terms:
-            fit = extended(start, views, terms)
+            # A larger set starts from the largest set within it.
+            within = (f for m, t, f in reversed(fits) if m == model and {*t} <= {*terms})
+            fit = extended(next(within, first), views, terms)
             fits.append((model, terms, fit))
-            # a larger set starts from this fit
-            start = fit if "k1" in terms else start
     if not fits:
         return ()
     # Compare all candidates on the same corners, rejected ones included. Each squared residual is

@@ -30,7 +30,11 @@ PositiveSize = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
 LEAST_FOCAL = 0.05
 """Share of the image's width below which a focal length cannot be in pixels: a fisheye lens with
 all of its 180 degrees in the image has a third, a mirror a fifth."""
-
+MOST_FOCAL = 200.0
+"""Image widths above which a focal length cannot be in pixels: the field of view would be below a
+third of a degree."""
+MOST_ASPECT = 3.0
+"""Largest ratio of the two focal lengths; anamorphic lenses have up to two."""
 
 FIELD_MARGIN = 1e-9
 """Margin, as a difference of cosines, between valid rays and the border of the field, where image
@@ -63,16 +67,40 @@ class CameraSchema(Schema):
     @field_validator("focal")
     @classmethod
     def _in_pixels(cls, focal: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
-        """Check that focal lengths are in pixels: no field of view is so wide that they are less
-        than a twentieth of the width.
-        """
+        """Check that focal lengths are in pixels, by the field of view, and alike."""
         width = info.data.get("image_size", (0, 0))[0]
         if min(focal) < LEAST_FOCAL * width:
             raise ValueError(
                 f"the focal length {list(focal)} looks like millimetres; it is wanted in pixels, "
                 "which is millimetres divided by the size of a pixel in mm"
             )
+        if width and max(focal) > MOST_FOCAL * width:
+            raise ValueError(
+                f"no lens has this focal length; found {max(focal):g}, expected at most"
+                f" {MOST_FOCAL:g} times the image's width of {width}"
+            )
+        if max(focal) > MOST_ASPECT * min(focal):
+            raise ValueError(
+                f"the two focal lengths differ too much; found {list(focal)}, expected a ratio of"
+                f" at most {MOST_ASPECT:g}"
+            )
         return focal
+
+    @field_validator("center")
+    @classmethod
+    def _in_image(cls, center: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
+        """Check that the principal point lies in the image, where no covariance states how well it
+        is determined.
+        """
+        size = info.data.get("image_size")
+        if size is None or info.data.get("covariance") is not None:
+            return center
+        if all(-0.5 <= c <= n - 0.5 for c, n in zip(center, size, strict=True)):
+            return center
+        raise ValueError(
+            f"the principal point lies outside the image; found {list(center)}, expected a point"
+            f" in {size[0]}x{size[1]} pixels, the size of the images that were calibrated"
+        )
 
 
 USUAL_FOCAL, USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION = 0.005, 0.001, 0.01, 0.05

@@ -12,7 +12,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras.colmap import is_colmap, read_colmap
-from pkmcal.cameras.contract import LEAST_FOCAL, Camera, camera_models
+from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.cameras.foreign import Intrinsics, named_entry
 from pkmcal.cameras.mrcal import is_mrcal, read_mrcal
 from pkmcal.cameras.pinhole import PINHOLE_TERMS
@@ -225,6 +225,10 @@ _KALIBR_NAMES = {
     "extended_unified": ("eucm", "none"),
 }
 """Kalibr's camera and distortion model by camera model."""
+OPENCV_COEFFICIENTS = (0, 4, 5, 8, 12, 14)
+"""Numbers of distortion coefficients that OpenCV's lens models have."""
+ROS_MATRIX_ROUNDING = 1e-3
+"""Relative difference between the camera matrix and the projection matrix of one lens."""
 OPENCV_MODELS = ("pinhole", "rational", "fisheye", "unified")
 """Camera models that OpenCV has."""
 _ROS_TERMS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
@@ -305,11 +309,12 @@ def _from_opencv(text: str, label: str) -> Camera:
                 found=quoted(values.tolist()),
                 expected=count_of(count, "finite number"),
             )
-    size = (round(float(numbers["width"][0])), round(float(numbers["height"][0])))
+    size = float(numbers["width"][0]), float(numbers["height"][0])
     k = numbers["distortion"] if numbers["distortion"] is not None else np.zeros(0)
     xi = numbers["xi"]
     model = "unified" if xi is not None else "fisheye" if fisheye else _opencv_model(k)
     own = {} if xi is None else {"xi": float(xi[0])}
+    _check_coefficients(k, f"{label}, {_OPENCV_NAMES['distortion'][0]}")
     return _camera_from_numbers(model, size, numbers["matrix"], k, own, label)
 
 
@@ -363,6 +368,7 @@ def _from_ros(document: Document) -> Camera:
     k = np.zeros(0)
     if "distortion_coefficients" in document.data:
         k = _numbers_at(document, ("distortion_coefficients", "data"), range(15))
+        _check_coefficients(k, document.where("distortion_coefficients"))
     if word in _ROS_ZERO and k.any():
         raise InputError(
             "this distortion model is supported without distortion only",
@@ -371,10 +377,44 @@ def _from_ros(document: Document) -> Camera:
             expected=listed(list(_ROS)),
             next_step="Calibrate again from images of a board: pkmcal camera",
         )
+    if not k.any():
+        _check_projection(document, matrix)
     model = _ROS.get(word, "pinhole")
     if model == "rational":
         model = _opencv_model(k)
     return _camera_from_numbers(model, size, matrix, k, {}, document.where("camera_matrix"))
+
+
+def _check_coefficients(k: Array, where: str) -> None:
+    """Raise `InputError` unless OpenCV's model has a version with this number of coefficients."""
+    if len(k) not in OPENCV_COEFFICIENTS:
+        raise InputError(
+            "OpenCV has no lens model with this number of distortion coefficients",
+            where=where,
+            found=f"{len(k)} terms",
+            expected=listed([str(n) for n in OPENCV_COEFFICIENTS]),
+        )
+
+
+def _check_projection(document: Document, matrix: Array) -> None:
+    """Raise `InputError` if the projection matrix of a ROS file without distortion and
+    rectification contradicts its camera matrix, (9,).
+    """
+    if not {"projection_matrix", "rectification_matrix"} <= document.data.keys():
+        return
+    projection = _numbers_at(document, ("projection_matrix", "data"), (12,)).reshape(3, 4)[:, :3]
+    rectification = _numbers_at(document, ("rectification_matrix", "data"), (9,))
+    rectified = not np.allclose(rectification, np.eye(3).ravel(), atol=1e-6)
+    if rectified or not projection.any():  # drivers write zeros where nothing was calibrated
+        return
+    if not np.allclose(projection.ravel(), matrix, rtol=ROS_MATRIX_ROUNDING, atol=0.01):
+        raise InputError(
+            "camera_matrix and projection_matrix contradict each other",
+            where=document.where("projection_matrix"),
+            found=quoted(projection.ravel().tolist()),
+            expected=f"{quoted(matrix.tolist())}, for images without distortion",
+            next_step="Calibrate again from images of a board: pkmcal camera",
+        )
 
 
 def _opencv_model(k: Array) -> str:
@@ -481,7 +521,7 @@ def _kalibr_data(camera: Camera) -> dict[str, Any]:
 
 
 def _camera_from_numbers(
-    model: str, size: tuple[int, int], matrix: Any, k: Array, own: dict[str, float], where: str
+    model: str, size: tuple[float, float], matrix: Any, k: Array, own: dict[str, float], where: str
 ) -> Camera:
     """Camera from another program's numbers, validated like pkmcal's own files.
 
@@ -493,20 +533,20 @@ def _camera_from_numbers(
     kind = camera_models()[model]
     most = len(kind.parameter_names) - 4 - len(kind.own)
     m = np.asarray(matrix, dtype=float).reshape(3, 3)
+    rest = [m[1, 0], *m[2]]
     faults = (
         (m[0, 1] != 0, "skew, which no model here has", f"{m[0, 1]:g}"),
         (not np.all(np.isfinite([*m.ravel(), *k])), "numbers that are not finite", "nan or inf"),
-        (np.any(k[most:] != 0), f"distortion beyond the model's {most} terms", f"{len(k)} terms"),
-        (min(m[0, 0], m[1, 1]) <= 0, "a focal length that is not positive", f"{m[0, 0]:g}"),
         (
-            model == "unified" and own["xi"] < 0,
-            "a negative xi; it should be 0 or more",
-            f"{own.get('xi')}",
+            not np.allclose(rest, [0, 0, 0, 1]),
+            "a matrix that is not [fx, 0, cx, 0, fy, cy, 0, 0, 1], row by row",
+            quoted(m.ravel().tolist()),
         ),
+        (np.any(k[most:] != 0), f"distortion beyond the model's {most} terms", f"{len(k)} terms"),
         (
-            min(m[0, 0], m[1, 1]) < LEAST_FOCAL * size[0],
-            "a focal length that looks like millimetres; it is wanted in pixels",
-            f"{m[0, 0]:g} at a width of {size[0]}",
+            any(n != round(n) for n in size),
+            "an image size that is no whole number of pixels",
+            quoted(list(size)),
         ),
     )
     for wrong, what, item in faults:
@@ -514,7 +554,7 @@ def _camera_from_numbers(
             raise InputError(f"the camera has {what}", where=where, found=item)
     fields: dict[str, Any] = {
         "model": model,
-        "image_size": list(size),
+        "image_size": [round(n) for n in size],
         "focal": [float(m[0, 0]), float(m[1, 1])],
         "center": [float(m[0, 2]), float(m[1, 2])],
         "distortion": k[:most].tolist(),

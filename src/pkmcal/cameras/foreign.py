@@ -26,7 +26,7 @@ class Intrinsics:
     """
 
     model: str
-    image_size: tuple[int, int]
+    image_size: tuple[float, float]
     focal: tuple[float, float]
     center: tuple[float, float]
     distortion: tuple[float, ...]

@@ -60,7 +60,7 @@ def read_mrcal(text: str, label: str) -> Intrinsics:
     width, height = _numbers(fields.get("imagersize"), 2, f"{label}, imagersize")
     return Intrinsics(
         model="rational",
-        image_size=(round(width), round(height)),
+        image_size=(width, height),
         focal=(numbers[0], numbers[1]),
         center=(numbers[2], numbers[3]),
         distortion=tuple(numbers[4:]),

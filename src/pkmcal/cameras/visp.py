@@ -50,7 +50,7 @@ def read_visp(text: str, label: str, name: str | None) -> Intrinsics:
     px, py, u0, v0 = (_number(model, key, label) for key in ("px", "py", "u0", "v0"))
     return Intrinsics(
         model="pinhole",
-        image_size=(round(width), round(height)),
+        image_size=(width, height),
         focal=(px, py),
         center=(u0, v0),
         distortion=(_number(model, "kud", label),) if word == _WITH else (),

@@ -33,6 +33,10 @@ ROTATION_STEPS = 50
 """Maximum number of Gauss-Newton steps for the best rotation; two or three suffice for equal
 lenses."""
 
+LEAST_MODE = 0.01
+"""Standard deviation of a mode of the difference, as a share of the largest, below which changes of
+second order exceed it (measured)."""
+
 
 @dataclass(frozen=True)
 class ComparedCamera:
@@ -198,21 +202,29 @@ def _without_rotation(spread: Array, camera: Camera, rays: Array, weight: Array)
 
 
 def _p_value(off: Array, spread: Array, weight: Array) -> float:
-    """P-value of the weighted sum of squared differences (n, 2).
+    """Probability of as unlikely differences (n, 2) by chance, the smaller of two, doubled.
 
-    The sum is distributed as chi-squares weighted by eigenvalues, which is approximated by a scaled
-    chi-square with the same mean and variance (Satterthwaite). spread : (n, 2, m) root of the
-    covariance.
+    The weighted sum of squares sees whatever differs over the image. It is one of chi-squares
+    weighted by eigenvalues; a scaled chi-square with the same mean and variance takes its place
+    (Satterthwaite). The amplitudes of the modes of the covariance, each over its standard
+    deviation, see a change that is large for the directions that are known well, such as a
+    distortion that differs at the border alone. spread : (n, 2, m) root of the covariance.
     """
     from scipy.special import gammaincc
 
     flat = (weight[:, None, None] * spread).reshape(-1, spread.shape[-1])
     normal = flat.T @ flat
     mean, variance = float(np.trace(normal)), 2 * float(np.sum(normal**2))
-    total = float(np.sum((weight[:, None] * off) ** 2))
+    weighted = (weight[:, None] * off).ravel()
+    total = float(weighted @ weighted)
     if total <= ROUNDING**2 or variance == 0:
         return 1.0 if total <= ROUNDING**2 else 0.0
-    return float(gammaincc(mean**2 / variance, total * mean / variance))
+    overall = gammaincc(mean**2 / variance, total * mean / variance)
+    modes, sigmas, _ = np.linalg.svd(flat, full_matrices=False)
+    linear = sigmas > LEAST_MODE * sigmas[0]
+    amplitudes = modes[:, linear].T @ weighted / sigmas[linear]
+    by_modes = gammaincc(linear.sum() / 2, amplitudes @ amplitudes / 2)
+    return float(min(1.0, 2 * min(overall, by_modes)))
 
 
 def _with_verdict(d: CameraDifference, largest: float) -> CameraDifference:

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -75,6 +75,18 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         return grey
     clockwise = {6: True, 8: False}.get(exif.orientation, size[0] > size[1])
     return np.ascontiguousarray(np.rot90(grey, -1 if clockwise else 1))
+
+
+def narrowed(image: Integers, width: int) -> tuple[Any, float]:
+    """Image reduced to a width in px at most, and its scale, 1 for a narrower image."""
+    import cv2
+
+    scale = width / image.shape[1]
+    if scale >= 1:
+        return image, 1.0
+    # a strip keeps one row; both scales are equal otherwise
+    size = (width, 1) if scale * image.shape[0] < 1 else None
+    return cv2.resize(image, size, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
 
 
 def upright_turns(path: Path, image_size: tuple[int, int]) -> int:

@@ -74,7 +74,8 @@ class Sheet(Shape):
         printed = Print.of(board)
         low = np.array([printed.x[0], printed.y[0]])
         high = np.array([printed.x[-1], printed.y[-1]])
-        margin = 0.5 * (board.document.get("square") or board.document["marker"])
+        part = next(key for key in ("square", "marker", "spacing") if key in board.document)
+        margin = 0.5 * board.document[part]
         middle = np.array([*(low + high) / 2, BOARD_THICKNESS / 2])
         half = np.array([*(high - low) / 2 + margin, BOARD_THICKNESS / 2])
         box = Box(apply(T_outer_board, middle), T_outer_board[:3, :3].T, half)
