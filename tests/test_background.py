@@ -58,6 +58,7 @@ class Scene:
         height = rng.uniform(-0.8, 1.5, points)
         world = np.stack([away * np.cos(angle), away * np.sin(angle), height], axis=-1)
         names = rng.standard_normal((points, 128)).astype(np.float32)
+        names /= np.linalg.norm(names, axis=1, keepdims=True)
         self.T = [looking(a) for a in azimuths]
         self.textures = []
         for T in self.T:
@@ -70,7 +71,9 @@ class Scene:
             mistaken = rng.random(len(mine)) < wrong
             mine[mistaken] = mine[mistaken][rng.permutation(mistaken.sum())]
             self.textures.append(Texture(CAMERA.ray(pixel), pixel, mine))
-        self.room = Surroundings(lambda _: (np.zeros((0, 0), dtype=np.uint8), CAMERA))
+        self.room = Surroundings(
+            range(len(azimuths)), lambda _: (np.zeros((0, 0), dtype=np.uint8), CAMERA)
+        )
         self.room.texture = lambda k: self.textures[k]
 
     def placed(self, *which):

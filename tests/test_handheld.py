@@ -611,6 +611,7 @@ def test_the_room_may_decide_what_legs_do_not(searched, monkeypatch):
     rng = np.random.default_rng(2)
     world = rng.uniform(-1.2, 1.2, (6000, 3))
     names = rng.standard_normal((len(world), 128)).astype(np.float32)
+    names /= np.linalg.norm(names, axis=1, keepdims=True)
 
     def texture(image, camera, _options):
         k = next(k for k, p in enumerate(images) if p.images[0] is image)

@@ -173,7 +173,7 @@ def search_by_hand(
     first = np.zeros(1, dtype=int)  # one image represents a camera on a tripod
     at = {p.station: p.select(first) for p in images}
     by_hand = [k for k in at if session.stations[k].handheld]
-    room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
+    room = Surroundings(list(at), lambda k: (at[k].images[0], at[k].camera))
     answers: dict[int, _CachedHypotheses] = {}
     drawn = so_far = _LocalizationState(scene)
 
