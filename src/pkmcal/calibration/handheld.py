@@ -62,6 +62,11 @@ class HandheldOptions:
     # an image's best poses that are always scored again with a better known machine, whatever their
     # score by the image alone: a wrong pose corrupts the estimate
     scored_again: int = 4
+    # largest number of images that are scored with the nominal model, which takes twice as long as
+    # with a machine from images
+    most_from_nominal: int = 12
+    # largest number of rounds in which images without an accepted pose are scored again
+    most_rounds: int = 4
     # ratio by which the number of images that determine the machine must grow before the poses of
     # an image are scored anew
     rescoring_growth: float = 1.25
@@ -195,27 +200,30 @@ def search_by_hand(
             answers[k] = _CachedHypotheses(one, one)
             done = len(answers)
             progress(
-                f"Localizing images by hand: {done} of {len(by_hand)}", 0.4 * done / len(by_hand)
+                f"Localizing images by hand: {done} of {len(by_hand)}", 0.3 * done / len(by_hand)
             )
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
-        half = (len(clearer) + 1) // 2
-        progress(f"Scoring the {half} least ambiguous of {len(by_hand)} images", 0.4)
+        half = min((len(clearer) + 1) // 2, _OPTIONS.most_from_nominal)
+        progress(f"Scoring the {half} least ambiguous of {len(by_hand)} images", 0.3)
         rescore(clearer[:half])
         so_far = _with_sure(session, at, room, so_far, believed(), boards)
-        progress(f"Scoring the others, with {len(so_far.placed)} images localized", 0.55)
+        progress(f"Scoring the others, with {len(so_far.placed)} images localized", 0.5)
         rescore(clearer[half:])
-        # join the images of a board, and repeat until no image is added
+        # join the images of a board, and repeat while images are added
         for k, one in _on_board(hypotheses(), boards).items():
             answers[k] = replace(answers[k], places=one)
         before, so_far = drawn, _with_sure(session, at, room, so_far, believed(), boards)
-        rest = part(progress, 0.6, 1)
-        while so_far.scene is not before.scene:
-            before, T = so_far, believed()
+        for number in range(_OPTIONS.most_rounds):
+            T = believed()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
-            placed = len(by_hand) - len(unsure)
-            rest = part(rest, 0.3, 1)
-            rest(f"Scoring again, with {placed} of {len(by_hand)} images localized", 0)
+            if so_far.scene is before.scene or not unsure:
+                break
+            before, placed = so_far, len(by_hand) - len(unsure)
+            progress(
+                f"Scoring again, with {placed} of {len(by_hand)} images localized",
+                0.7 + 0.3 * number / _OPTIONS.most_rounds,
+            )
             rescore(unsure)
             so_far = _with_sure(session, at, room, so_far, believed(), boards)
     out = believed()
@@ -270,6 +278,7 @@ class _CachedHypotheses:
     scores : by the joint estimate, None before it.
     by : marginal prior of the machine at that time, None for the nominal model.
     beside : number of images that determined the machine.
+    anew : whether ``hypotheses`` are by a machine from images.
     """
 
     hypotheses: PoseHypotheses
@@ -277,6 +286,7 @@ class _CachedHypotheses:
     scores: ScoredPoses | None = None
     by: MarginalPrior | None = None
     beside: int = 0
+    anew: bool = False
 
 
 def _with_sure(
@@ -350,20 +360,22 @@ def _search(
     """Pose hypotheses of an image, weighted by its legs and by the background.
 
     The background is compared with that of the images with accepted poses; earlier hypotheses are
-    among the candidates. Once images have determined the machine, the image is localized by itself
-    once more; later images change the machine little. Poses that were scored with a similar machine
-    are not scored again.
+    among the candidates. An image that stays ambiguous is localized by itself once more with the
+    first machine from images; later images change the machine little. Poses that were scored with a
+    similar machine are not scored again.
     """
     p, scene, placed, k = image, so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
-    # localize anew with the first machine from images; reuse the scores of a similar machine
-    if scene.prior is not None:
-        if before.by is None:
-            alone = _image_hypotheses(session, scene, p)
-        elif len(placed) < _OPTIONS.rescoring_growth * before.beside and scene.prior.like(
-            before.by
-        ):
-            scores, by, beside = before.scores, before.by, before.beside
+    anew = before.anew or (scene.prior is not None and before.scores is not None)
+    if anew and not before.anew:
+        alone = _image_hypotheses(session, scene, p)
+    elif (
+        scene.prior is not None
+        and before.by is not None
+        and len(placed) < _OPTIONS.rescoring_growth * before.beside
+        and scene.prior.like(before.by)
+    ):
+        scores, by, beside = before.scores, before.by, before.beside
     # further candidates: from landmarks, from the last scoring, and from the background
     likely = before.places.T_camera_base[: _OPTIONS.scored_again]
     others = np.concatenate([room.place(k, so_far.landmarks), likely])
@@ -374,7 +386,7 @@ def _search(
     closer, scores = rescore_poses(session, p, scene, alone, others, scores)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
-    return _CachedHypotheses(alone, places, scores, by, beside)
+    return _CachedHypotheses(alone, places, scores, by, beside, anew)
 
 
 def _legs(

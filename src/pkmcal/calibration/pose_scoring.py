@@ -101,7 +101,8 @@ def register_images(
     n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
     every = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
     near = {
-        k: refine_local(view(k, scene), T, _OPTIONS.silhouette_scatter)[0] for k, T in every.items()
+        k: refine_local(view(k, scene), T, _OPTIONS.silhouette_scatter)[0] if k in places else T
+        for k, T in every.items()
     }
     updated_scene = scene._replace(prior=None)
     while True:
@@ -174,7 +175,9 @@ def _measurement_pass(
     numbered = of_stations({n: edges[k] for n, k in enumerate(stations)})
     measurements = measurements_of(only, visible, numbered)
     start = start_state(scene.machine, measurements, np.stack([places[k] for k in stations]))
-    estimate = bundle(session.machine, measurements, start, marginal_prior=scene.prior)
+    estimate = bundle(
+        session.machine, measurements, start, marginal_prior=scene.prior, scale_readings=False
+    )
     # results back into the scene of all stations
     at = scene.T_camera_base.copy()
     at[stations] = estimate.state.T_camera_base
