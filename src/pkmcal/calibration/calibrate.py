@@ -33,7 +33,12 @@ from pkmcal.calibration.faults import (
     scale_notes,
     size_notes,
 )
-from pkmcal.calibration.handheld import inconsistent_poses, localize_case, without_misplaced
+from pkmcal.calibration.handheld import (
+    inconsistent_poses,
+    localization_share,
+    localize_case,
+    without_misplaced,
+)
 from pkmcal.calibration.heights import ProbedHeights, probed_heights
 from pkmcal.calibration.image_rotation import UpsideDown, rotation_finding, upside_down
 from pkmcal.calibration.leg_numbering import numbering_note
@@ -191,7 +196,8 @@ def calibrate_session(
     with threadpool_limits(1, "blas"):
         clock = Clock(progress)
         session = _load(session, refine_camera, holdout, clock)
-        located = case or _observe(session, seed, clock.part(0, 0.25))
+        share = localization_share(session)
+        located = case or _observe(session, seed, clock.part(0, share))
 
         def calibrated(refine: bool, first: float, last: float) -> Calibration:
             own = clock.part(first, last)
@@ -199,9 +205,10 @@ def calibrate_session(
             return _finished(settled, method, seed, holdout, own.part(0.5, 1))
 
         if not refine_camera or refinement_of(session, False).refines_all:
-            return calibrated(refine_camera, 0.25, 1)
+            return calibrated(refine_camera, share, 1)
+        middle = (share + 1) / 2
         return better_refined(
-            partial(calibrated, True, 0.25, 0.6), partial(calibrated, False, 0.6, 1)
+            partial(calibrated, True, share, middle), partial(calibrated, False, middle, 1)
         )
 
 

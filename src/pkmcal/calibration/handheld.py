@@ -27,6 +27,15 @@ from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.localization import LegLocalization, locate_stations
+from pkmcal.calibration.localization_cache import (
+    Localized,
+    image_name,
+    remember_image,
+    remember_session,
+    remembered_image,
+    remembered_session,
+    session_name,
+)
 from pkmcal.calibration.pose_scoring import ScoredPoses, register_images, rescore_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
@@ -94,6 +103,12 @@ class Localization:
     leg_localization: LegLocalization | None
     places: Mapping[int, PoseHypotheses]
     result: Case | PkmcalError
+
+
+def localization_share(session: Session) -> float:
+    """Share of a calibration's time that the localization of its images takes, about."""
+    by_hand = [station.handheld for station in session.stations]
+    return 0.25 + 0.5 * sum(by_hand) / max(len(by_hand), 1)
 
 
 def localize_case(
@@ -166,7 +181,7 @@ def search_by_hand(
     progress: Progress = no_progress,
 ) -> tuple[dict[int, PoseHypotheses], PriorScene]:
     """Pose hypotheses of each hand-held image, by station number, and the scene with accepted
-    poses.
+    poses; from the cache where the same images were localized before.
 
     T_camera_base of the scene is NaN for images without an accepted pose.
 
@@ -175,6 +190,22 @@ def search_by_hand(
         the others.
     progress : called with the step as text and the share done.
     """
+    name = session_name(session, [p.station for p in images], boards, scene)
+    localized = remembered_session(name, session.machine)
+    if localized is None:
+        localized = _searched(session, images, boards, scene, progress)
+        remember_session(name, localized)
+    return localized
+
+
+def _searched(
+    session: Session,
+    images: list[StationImages],
+    boards: Boards,
+    scene: PriorScene,
+    progress: Progress,
+) -> Localized:
+    """Localization by :func:`search_by_hand`, without the cache."""
     first = np.zeros(1, dtype=int)  # one image represents a camera on a tripod
     at = {p.station: p.select(first) for p in images}
     by_hand = [k for k in at if session.stations[k].handheld]
@@ -185,17 +216,20 @@ def search_by_hand(
     def hypotheses() -> dict[int, PoseHypotheses]:
         return {k: answer.places for k, answer in answers.items() if answer.scores is not None}
 
-    def rescore(some: Sequence[int]) -> None:
+    def rescore(some: Sequence[int], text: str, progress: Progress) -> None:
+        progress(text, 0.0)
         search = partial(_search, session, room, so_far)
         now = pool.map(search, [at[k] for k in some], [answers[k] for k in some])
-        answers.update(zip(some, now, strict=True))
+        for done, (k, one) in enumerate(zip(some, now, strict=True), start=1):
+            answers[k] = one
+            progress(f"{text}: {done} of {len(some)}", done / len(some))
 
     def believed() -> Array:
         return _believed(hypotheses(), len(by_hand), boards, scene.T_camera_base)
 
     with ThreadPoolExecutor(THREADS) as pool:
         # each image by itself
-        alone = pool.map(partial(_image_hypotheses, session, scene), [at[k] for k in by_hand])
+        alone = pool.map(partial(_alone, session, scene), [at[k] for k in by_hand])
         for k, one in zip(by_hand, alone, strict=True):
             answers[k] = _CachedHypotheses(one, one)
             done = len(answers)
@@ -205,27 +239,25 @@ def search_by_hand(
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = min((len(clearer) + 1) // 2, _OPTIONS.most_from_nominal)
-        progress(f"Scoring the {half} least ambiguous of {len(by_hand)} images", 0.3)
-        rescore(clearer[:half])
+        rescore(clearer[:half], "Scoring the least ambiguous images", part(progress, 0.3, 0.5))
         so_far = _with_sure(session, at, room, so_far, believed(), boards)
-        progress(f"Scoring the others, with {len(so_far.placed)} images localized", 0.5)
-        rescore(clearer[half:])
+        text = f"Scoring the others, with {len(so_far.placed)} images localized"
+        rescore(clearer[half:], text, part(progress, 0.55, 0.7))
         # join the images of a board, and repeat while images are added
         for k, one in _on_board(hypotheses(), boards).items():
             answers[k] = replace(answers[k], places=one)
         before, so_far = drawn, _with_sure(session, at, room, so_far, believed(), boards)
-        for number in range(_OPTIONS.most_rounds):
+        rest = part(progress, 0.75, 1)
+        for _ in range(_OPTIONS.most_rounds):
             T = believed()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
             if so_far.scene is before.scene or not unsure:
                 break
             before, placed = so_far, len(by_hand) - len(unsure)
-            progress(
-                f"Scoring again, with {placed} of {len(by_hand)} images localized",
-                0.7 + 0.3 * number / _OPTIONS.most_rounds,
-            )
-            rescore(unsure)
+            text = f"Scoring again, with {placed} of {len(by_hand)} images localized"
+            rescore(unsure, text, part(rest, 0, 0.4))
             so_far = _with_sure(session, at, room, so_far, believed(), boards)
+            rest = part(rest, 0.5, 1)
     out = believed()
     for k in by_hand:
         if k in so_far.scene.edges:
@@ -338,6 +370,16 @@ def _too_few_edges(scene: PriorScene, image: StationImages) -> bool:
     T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
     visible = np.unique(legs.measure(p, machine, T, poses).edges.leg)
     return len(visible) < min(_OPTIONS.fewest_legs, machine.n_legs)
+
+
+def _alone(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
+    """Pose hypotheses from one image alone, from the cache where it was localized before."""
+    name = image_name(session, scene.machine, image.station)
+    hypotheses = remembered_image(name)
+    if hypotheses is None:
+        hypotheses = _image_hypotheses(session, scene, image)
+        remember_image(name, hypotheses)
+    return hypotheses
 
 
 def _image_hypotheses(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:

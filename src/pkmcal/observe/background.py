@@ -279,9 +279,13 @@ class Surroundings:
         pool = np.concatenate(every)
         drawn = np.random.default_rng(0).permutation(len(pool))[: self.options.words]
         words = pool[drawn].T
-        count = np.stack(
-            [np.bincount((one @ words).argmax(axis=1), minlength=len(drawn)) for one in every]
-        ) if len(drawn) else np.zeros((len(every), 1))
+        count = (
+            np.stack(
+                [np.bincount((one @ words).argmax(axis=1), minlength=len(drawn)) for one in every]
+            )
+            if len(drawn)
+            else np.zeros((len(every), 1))
+        )
         rarity = np.log(len(every) / np.maximum((count > 0).sum(axis=0), 1))
         weight = count * rarity
         weight = weight / np.maximum(np.sqrt(dot(weight, weight)), 1e-9)[:, None]
