@@ -34,7 +34,15 @@ from pkmcal.calibration.results import calibration_document
 from pkmcal.checks.check import check_session
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import Exif, open_image, read_exif, with_exif
-from pkmcal.geometry.rigid import angle_between, apply, perturb, pose, pose_difference, rotation
+from pkmcal.geometry.rigid import (
+    angle_between,
+    apply,
+    look_at,
+    perturb,
+    pose,
+    pose_difference,
+    rotation,
+)
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
@@ -626,6 +634,25 @@ def test_the_room_may_decide_what_legs_do_not(searched, monkeypatch):
     assert [s.name for s in results.session.stations] == [s.name for s in searched[0].stations]
 
 
+def posed(folder, words):
+    replaced(folder / "session.yaml", "handheld: true", f"handheld: true\n    {words}")
+
+
+def test_a_single_image_has_a_pose(folder):
+    place = "{position: [0, -1, 0.5], look_at: [0, 0, 0.2]}"
+    posed(folder, f"poses: {{0000-2: {place}}}")
+    first, second, third = load_session(folder).stations
+    assert (first.T_camera_base, third.T_camera_base) == (None, None)
+    np.testing.assert_allclose(second.T_camera_base, look_at([0, -1, 0.5], [0, 0, 0.2], [0, 0, 1]))
+
+
+def test_a_pose_of_an_image_that_is_not_there_is_refused(folder):
+    posed(folder, "poses: {0000-3: {position: [0, -1, 0.5], look_at: [0, 0, 0.2]}}")
+    with pytest.raises(InputError) as caught:
+        load_session(folder)
+    assert "stations.phone.poses.0000-3" in str(caught.value)
+
+
 def test_a_board_on_the_base_serves_images_by_hand(folder):
     """Each image has a pose of its own, so one entry is many stations."""
     board = SESSION.replace("observe: legs", "observe: [legs, board]")
@@ -700,6 +727,17 @@ def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):
     )
     assert not any("not localized" in text for text in words)
     assert check.forecast is None
+
+
+def test_a_pose_by_hand_places_an_ambiguous_image(searched, monkeypatch):
+    session, images, poses, truth = searched
+    rough = perturb(truth.T_camera_base[1], np.array([0.03, -0.03, 0.02, 0.02, -0.02, 0.03]))
+    first, second, third = session.stations
+    posed = replace(session, stations=(first, replace(second, T_camera_base=rough), third))
+    results = placed((posed, images, poses, truth), monkeypatch, [1e-4, 0.3, 1e-4])
+    assert not results.session.rejected
+    off = pose_difference(results.scene.T_camera_base, truth.T_camera_base)
+    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
 
 
 def test_no_image_by_hand_is_localized(searched, monkeypatch):

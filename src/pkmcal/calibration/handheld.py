@@ -46,7 +46,12 @@ from pkmcal.observe import legs
 from pkmcal.observe.background import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.image_batches import StationImages
-from pkmcal.observe.image_localization import PoseHypotheses, localize_image
+from pkmcal.observe.image_localization import (
+    PoseHypotheses,
+    finest_view,
+    localize_image,
+    localize_near,
+)
 from pkmcal.observe.pose_candidates import SAME_POSE_TURN, same_pose
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
@@ -75,7 +80,7 @@ class HandheldOptions:
     # with a machine from images
     most_from_nominal: int = 12
     # largest number of rounds in which images without an accepted pose are scored again
-    most_rounds: int = 4
+    most_rounds: int = 2
     # ratio by which the number of images that determine the machine must grow before the poses of
     # an image are scored anew
     rescoring_growth: float = 1.25
@@ -208,13 +213,15 @@ def _searched(
     """Localization by :func:`search_by_hand`, without the cache."""
     first = np.zeros(1, dtype=int)  # one image represents a camera on a tripod
     at = {p.station: p.select(first) for p in images}
-    by_hand = [k for k in at if session.stations[k].handheld]
+    stated, scene = _with_stated(session, scene, at)
+    by_hand = [k for k in at if session.stations[k].handheld and k not in stated]
     room = Surroundings(list(at), lambda k: (at[k].images[0], at[k].camera))
     answers: dict[int, _CachedHypotheses] = {}
     drawn = so_far = _LocalizationState(scene)
 
     def hypotheses() -> dict[int, PoseHypotheses]:
-        return {k: answer.places for k, answer in answers.items() if answer.scores is not None}
+        scored = {k: answer.places for k, answer in answers.items() if answer.scores is not None}
+        return stated | scored
 
     def rescore(some: Sequence[int], text: str, progress: Progress) -> None:
         progress(text, 0.0)
@@ -225,7 +232,7 @@ def _searched(
             progress(f"{text}: {done} of {len(some)}", done / len(some))
 
     def believed() -> Array:
-        return _believed(hypotheses(), len(by_hand), boards, scene.T_camera_base)
+        return _believed(hypotheses(), len(by_hand) + len(stated), boards, scene.T_camera_base)
 
     with ThreadPoolExecutor(THREADS) as pool:
         # each image by itself
@@ -258,14 +265,41 @@ def _searched(
             rescore(unsure, text, part(rest, 0, 0.4))
             so_far = _with_sure(session, at, room, so_far, believed(), boards)
             rest = part(rest, 0.5, 1)
-    out = believed()
+    out = _placed_at(so_far, believed(), (*by_hand, *stated))
+    untested = tuple(_untested(session, so_far, answers, out))
+    return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
+
+
+def _with_stated(
+    session: Session, scene: PriorScene, at: Mapping[int, StationImages]
+) -> tuple[dict[int, PoseHypotheses], PriorScene]:
+    """Hand-held images whose pose the session states: the likeliest pose near it, alone, by
+    station; and the scene with these poses.
+    """
+    T_camera_base = scene.T_camera_base.copy()
+    stated: dict[int, PoseHypotheses] = {}
+    for k, p in at.items():
+        T = session.stations[k].T_camera_base
+        if T is None or not session.stations[k].handheld:
+            continue
+        view = finest_view(scene.machine, p, session.joints, scene.T_base_platform)
+        near = localize_near(view, p.images[0], T)
+        stated[k] = PoseHypotheses(near.T_camera_base[:1], near.log_likelihood_ratio[:1], near.unit)
+        T_camera_base[k] = near.T_camera_base[0]
+    return stated, scene._replace(T_camera_base=T_camera_base)
+
+
+def _placed_at(so_far: _LocalizationState, believed: Array, by_hand: Sequence[int]) -> Array:
+    """T_camera_base (S, 4, 4) in the end: estimated for registered images, NaN where too few legs
+    can be measured.
+    """
+    out = believed.copy()
     for k in by_hand:
         if k in so_far.scene.edges:
             out[k] = so_far.scene.T_camera_base[k]
         elif k in so_far.bare:
             out[k] = np.nan
-    untested = tuple(_untested(session, so_far, answers, out))
-    return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
+    return out
 
 
 def _untested(
@@ -364,12 +398,32 @@ def _with_sure(
     return _LocalizationState(scene, placed, room.landmarks(placed), bare)
 
 
-def _too_few_edges(scene: PriorScene, image: StationImages) -> bool:
-    """Whether too few legs can be measured in an image at its pose."""
+def _too_few_edges(
+    scene: PriorScene, image: StationImages, T_camera_base: Array | None = None
+) -> bool:
+    """Whether too few legs can be measured in an image at a pose (4, 4), by default the scene's."""
     p, machine = image, scene.machine
-    T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
+    T = scene.T_camera_base[p.station] if T_camera_base is None else T_camera_base
+    poses = scene.T_base_platform[p.configuration]
     visible = np.unique(legs.measure(p, machine, T, poses).edges.leg)
     return len(visible) < min(_OPTIONS.fewest_legs, machine.n_legs)
+
+
+def _measurable(
+    scene: PriorScene, image: StationImages, hypotheses: PoseHypotheses
+) -> PoseHypotheses:
+    """The hypotheses at which legs can be measured, or all if there are none.
+
+    Silhouettes match anywhere; with a machine from images, legs can be measured at the correct pose
+    only, so a rival at which they cannot is none.
+    """
+    good = [not _too_few_edges(scene, image, T) for T in hypotheses.T_camera_base]
+    if not any(good):
+        return hypotheses
+    return hypotheses._replace(
+        T_camera_base=hypotheses.T_camera_base[good],
+        log_likelihood_ratio=hypotheses.log_likelihood_ratio[good],
+    )
 
 
 def _alone(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
@@ -428,6 +482,8 @@ def _search(
     closer, scores = rescore_poses(session, p, scene, alone, others, scores)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
+    if scene.prior is not None:
+        places = _measurable(scene, p, places)
     return _CachedHypotheses(alone, places, scores, by, beside, anew)
 
 
