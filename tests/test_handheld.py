@@ -34,6 +34,7 @@ from pkmcal.calibration.results import calibration_document
 from pkmcal.checks.check import check_session
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import Exif, open_image, read_exif, with_exif
+from pkmcal.files.cache import cache_folder
 from pkmcal.geometry.rigid import (
     angle_between,
     apply,
@@ -727,6 +728,33 @@ def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):
     )
     assert not any("not localized" in text for text in words)
     assert check.forecast is None
+
+
+def test_the_same_images_are_searched_once(searched, monkeypatch):
+    """Cached poses, edges and rejections are those of the search; other data are searched."""
+    session, images, _, _ = searched
+    first = placed(searched, monkeypatch, [1e-4, 0.3, 1e-4])
+
+    def searched_again(*_):
+        raise RuntimeError
+
+    monkeypatch.setattr(handheld, "rescore_poses", searched_again)
+    arguments = images, Boards(), np.random.default_rng(0)
+    again = handheld.localize_case(session, *arguments)
+    np.testing.assert_array_equal(again.scene.T_camera_base, first.scene.T_camera_base)
+    np.testing.assert_array_equal(again.scene.machine.values, first.scene.machine.values)
+    assert again.session.warnings == first.session.warnings
+    for k, edges in first.scene.edges.items():
+        np.testing.assert_array_equal(again.scene.edges[k].normal, edges.normal)
+        np.testing.assert_array_equal(again.scene.edges[k].coarse, edges.coarse)
+    noisier = replace(session, joint_noise=2 * session.joint_noise)
+    with pytest.raises(RuntimeError):
+        handheld.localize_case(noisier, *arguments)
+    # a file of something else under the right name
+    (path,) = cache_folder().glob("session-*.npz")
+    np.savez(path, images=np.arange(3))
+    with pytest.raises(RuntimeError):
+        handheld.localize_case(session, *arguments)
 
 
 def test_a_pose_by_hand_places_an_ambiguous_image(searched, monkeypatch):
