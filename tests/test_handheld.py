@@ -46,6 +46,7 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.judge.new_data import measured_new_data
 from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
 from pkmcal.measurements.effects import FOCAL_EXCESS, FOCAL_SIGMA, SHADING
 from pkmcal.mechanisms import load_mechanism
@@ -65,6 +66,7 @@ from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, tube_chart
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Level
+from pkmcal.outcome.progress import no_progress
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.placement.stations import rough_poses
 from pkmcal.report.calibration import outcome_of
@@ -755,6 +757,23 @@ def test_the_same_images_are_searched_once(searched, monkeypatch):
     np.savez(path, images=np.arange(3))
     with pytest.raises(RuntimeError):
         handheld.localize_case(session, *arguments)
+
+
+@pytest.mark.slow
+def test_new_data_of_a_calibrated_machine_use_the_same_poses(searched, monkeypatch):
+    """Which `check` and `calibrate` cached, by the session's nominal model."""
+    session, _, _, truth = searched
+    first = placed(searched, monkeypatch, [1e-4, 1e-4, 1e-4])
+
+    def searched_again(*_):
+        raise RuntimeError
+
+    monkeypatch.setattr(handheld, "rescore_poses", searched_again)
+    saved = SimpleNamespace(machine=truth.machine, document={"stations": []})
+    value = measured_new_data(saved, session, 0, no_progress)
+    assert value.session.machine is truth.machine
+    names = [station.name for station in first.session.stations]
+    assert [station.name for station in value.session.stations] == names
 
 
 def test_a_pose_by_hand_places_an_ambiguous_image(searched, monkeypatch):

@@ -197,7 +197,7 @@ def calibrate_session(
         clock = Clock(progress)
         session = _load(session, refine_camera, holdout, clock)
         share = localization_share(session)
-        located = case or _observe(session, seed, clock.part(0, share))
+        located = case or observed_case(session, seed, clock.part(0, share))
 
         def calibrated(refine: bool, first: float, last: float) -> Calibration:
             own = clock.part(first, last)
@@ -369,7 +369,7 @@ def settle(
             repaired = session
             for one in repairs:
                 repaired = one.hypothesis.apply(repaired)
-            case = _observe(repaired, seed, now.part(0.9, 1))
+            case = observed_case(repaired, seed, now.part(0.9, 1))
             continue
         # stations that are not where they were localized
         wrong = misplaced_stations(case.session, turns) or inconsistent_poses(
@@ -436,9 +436,11 @@ def _load(
     return session
 
 
-def _observe(session: Session, seed: int, clock: Clock) -> Case:
+def observed_case(session: Session, seed: int, clock: Clock) -> Case:
     """The case of a session with its stations localized, without hand-held images that could not be
     placed.
+
+    seed : for the random search. Raises as :func:`calibrate_session`.
     """
     clock.progress("Reading images", 0.0)
     images = read_images(session)

@@ -384,9 +384,9 @@ def _with_sure(
         )
         if bare == new.keys():
             return so_far._replace(bare=bare) if bare != so_far.bare else so_far
-        if bare:
-            rest = {k: T for k, T in new.items() if k not in bare}
-            joined = register_images(session, images, scene, rest, boards)
+        if bare:  # the others again, from where they are now
+            rest = {k: edges for k, edges in joined.edges.items() if k not in bare}
+            joined = register_images(session, images, joined._replace(edges=rest), {}, boards)
         scene = joined
     except PkmcalError as error:
         return so_far._replace(failure=str(error))

@@ -89,7 +89,7 @@ class ImageLocalizationOptions:
     # the radius of the base. No real parts are exactly interchangeable, but in an image they look
     # so
     joint_distance: float = 0.2
-    # rounds of the search near a pose
+    # rounds of the search near a pose, which ends with the first that gains nothing
     near_rounds: int = 3
     # starts in each round
     near_starts: int = 32
@@ -250,8 +250,9 @@ def refine_local(
         starts = starts[np.argsort(-log_likelihood_ratio)[: options.near_refined]]
         starts, log_likelihood_ratio = refine_ml(view, starts, one, 16, 10, scatter)
         k = int(np.argmax(log_likelihood_ratio))
-        if log_likelihood_ratio[k] > most:
-            best, most = starts[k], float(log_likelihood_ratio[k])
+        if log_likelihood_ratio[k] < most + view.options.least_gain:
+            break
+        best, most = starts[k], float(log_likelihood_ratio[k])
     return best, most
 
 
