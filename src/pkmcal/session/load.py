@@ -119,7 +119,10 @@ class RejectedStation:
     def finding(self) -> Finding:
         """Warning about the rejected station."""
         return doubtful(
-            "rejected.station", self.label, station=self.station.name, reason=self.reason
+            "rejected.image" if self.station.handheld else "rejected.station",
+            self.label,
+            station=self.station.name,
+            reason=self.reason,
         )
 
 
