@@ -63,7 +63,7 @@ class StationDocument(Schema):
     pose: PoseDocument | None = None
     handheld: bool = False
     poses: dict[str, PoseDocument] = Field(
-        default={},
+        default_factory=dict[str, PoseDocument],
         description="rough poses of single hand-held images, by configuration and repeat such as"
         " 0003-2",
     )
