@@ -791,6 +791,7 @@ def test_a_pose_by_hand_places_an_ambiguous_image(searched, monkeypatch):
     rough = perturb(truth.T_camera_base[1], np.array([0.03, -0.03, 0.02, 0.02, -0.02, 0.03]))
     first, second, third = session.stations
     posed = replace(session, stations=(first, replace(second, T_camera_base=rough), third))
+    assert placed(searched, monkeypatch, [1e-4, 0.3, 1e-4]).session.rejected
     results = placed((posed, images, poses, truth), monkeypatch, [1e-4, 0.3, 1e-4])
     assert not results.session.rejected
     off = pose_difference(results.scene.T_camera_base, truth.T_camera_base)

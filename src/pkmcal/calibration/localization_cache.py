@@ -59,12 +59,17 @@ def session_name(
 
 
 def _stated(session: Session, station: int) -> list[Any]:
-    """Camera, configurations and image digests of a station, as plain data."""
+    """Camera, rough pose, configurations and image digests of a station, as plain data."""
     one = session.stations[station]
     files = [blake2b(photo.path.read_bytes(), digest_size=16).hexdigest() for photo in one.images]
     rows = [photo.configuration for photo in one.images]
     camera = one.camera
-    return [camera.model, camera.image_size, camera.parameters, one.response, rows, files]
+    return [
+        [camera.model, camera.image_size, camera.parameters, one.response],
+        one.T_camera_base,
+        rows,
+        files,
+    ]
 
 
 def remembered_image(name: str) -> PoseHypotheses | None:

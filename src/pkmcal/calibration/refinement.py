@@ -355,7 +355,8 @@ def _measurement_pass(
 
     def station_edges(some: Sequence[StationImages]) -> list[legs.StationEdges]:
         passes = _measure(some, estimate, blur, refine, done)
-        return [whole(p, one) for p, one in zip(some, passes, strict=True)]
+        with ThreadPoolExecutor(THREADS) as pool:  # distance tables take most of the time
+            return list(pool.map(whole, some, passes))
 
     return _search_pass(images, station_edges)
 
