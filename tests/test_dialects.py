@@ -4,6 +4,8 @@ and Repetier-Firmware's files.
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -14,9 +16,11 @@ from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
 from pkmcal.exporters.delta import read_firmware_from_base
 from pkmcal.firmware.contract import firmwares, read_printer
-from pkmcal.firmware.session import nominal_text
+from pkmcal.firmware.probed import read_measured
+from pkmcal.firmware.session import nominal_text, printer_session_texts
 from pkmcal.geometry.rigid import apply
 from pkmcal.mechanisms import load_mechanism
+from test_marlin import CONFIGURATION
 
 SMOOTHIE = """\
 Recv: ;Steps per unit:
@@ -182,3 +186,105 @@ def test_values_that_config_g_loads_count_where_their_file_is_beside_it(tmp_path
     assert len(printer.remarks) == 1
     (tmp_path / "config.g").write_text(f"M501\n{own}")
     assert read_printer(tmp_path / "config.g").radius == 100
+
+
+def test_points_of_smoothieware_are_the_nozzles_at_contact(tmp_path):
+    printer = read_printer(text_file(tmp_path, CONFIG))
+    a = np.deg2rad(60 * np.arange(6) + 30)
+    want = np.column_stack([80 * np.cos(a), 80 * np.sin(a), 0.1 * np.arange(6)])
+    want = np.vstack([want, [0, 0, -0.2]])
+    text = "initial Bed ht is 295.000000 mm\ncenter probe: 0.0100\n"
+    text += "".join(f"< X{x:.4f} Y{y:.4f} Z{z:.4f}\n" for x, y, z in want)
+    touches, _ = read_measured(text_file(tmp_path, text + "max delta: 0.7\n", "log.txt"), printer)
+    ideal = Ideal(printer.radius, printer.angle, printer.rod, printer.homed)
+    np.testing.assert_allclose(ideal.tool(touches.carriages), want, atol=1e-3)
+    assert not touches.heights.any()
+    # G29 without its .1 prints the probe's travel
+    text = re.sub(r"X(\S+) Y(\S+) Z(\S+)", r"X:\1 Y:\2 Z:\3 A:1.0 B:1.0 C:1.0", text)
+    with pytest.raises(InputError) as caught:
+        read_measured(text_file(tmp_path, text, "log.txt"), printer)
+    assert "G29.1" in caught.value.next_step
+
+
+@pytest.mark.parametrize(("off", "reported"), [(0.5, False), (16.0, True), (-4.0, True)])
+def test_a_bed_far_from_z_0_is_a_remark(off, reported, tmp_path):
+    """As of a probe's offset with the wrong sign: the height at home would change by as much."""
+    (tmp_path / "printer.cfg").write_text(printers.printer_cfg(printers.Settings()))
+    lines = [f"probe at {x:.3f},{y:.3f} is z={off:.4f}" for x, y in printers.bed(13)]
+    (tmp_path / "probed.txt").write_text("\n".join(lines))
+    _, remarks = printer_session_texts(tmp_path / "printer.cfg", tmp_path / "probed.txt")
+    assert [f"Z {off:g} mm" in one for one in remarks] == ([True] if reported else [])
+
+
+# ------------------------------------------------------------------ misspelt names
+
+NAMED = {
+    "klipper": (printers.printer_cfg(printers.Settings()), "printer.cfg"),
+    "marlin": (CONFIGURATION, "Configuration.h"),
+    "smoothie": (CONFIG, "config"),
+}
+
+
+def misspelt(name, key, wrong, folder):
+    """File of a firmware with a key misspelt in all places; None for none."""
+    text, file = NAMED[name]
+    if key is not None:
+        assert key in text
+        text = text.replace(key, wrong)
+    (folder / file).write_text(text)
+    return folder / file
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "wrong"),
+    [
+        ("klipper", "delta_radius", "delta_raduis"),
+        ("klipper", "arm_length", "arm_lenght"),
+        ("klipper", "[stepper_a]", "[steper_a]"),
+        ("marlin", "DELTA_HEIGHT", "DELTA_HIGHT"),
+        ("smoothie", "arm_radius", "arm_raduis"),
+        ("smoothie", "arm_length", "arm_lenght"),
+    ],
+)
+def test_a_misspelt_name_of_a_needed_value_is_in_the_error(name, key, wrong, tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_printer(misspelt(name, key, wrong, tmp_path))
+    assert wrong in caught.value.found
+    assert key in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "wrong"),
+    [
+        ("klipper", "angle", "anlge"),
+        ("klipper", "print_radius", "print_raduis"),
+        ("marlin", "DELTA_ENDSTOP_ADJ", "DELTA_ENSTOP_ADJ"),
+        ("smoothie", "gamma_trim", "gama_trim"),
+    ],
+)
+def test_a_misspelt_name_of_a_value_with_a_default_is_a_remark(name, key, wrong, tmp_path):
+    remarks = read_printer(misspelt(name, key, wrong, tmp_path)).remarks
+    (*named,) = (one for one in remarks if wrong in one)
+    assert len(named) == (3 if key == "angle" else 1)
+    assert all(key in one for one in named)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_names_without_a_mistake_give_no_remark(name, tmp_path):
+    remarks = read_printer(misspelt(name, None, None, tmp_path)).remarks
+    assert not any("is not read" in one for one in remarks)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["M665 L{global.rod} R105 H300", "M665 L270 R105 H{300 + var.more}", "M92 X{80} Y80 Z80"],
+)
+def test_expressions_of_reprapfirmware_are_refused_with_what_to_write(line, tmp_path):
+    text = "M665 L270 R105 H300 B90\nM666 X0 Y0 Z0 A0 B0 ; {a comment}\nM92 X80 Y80 Z80\n"
+    (tmp_path / "config.g").write_text(text)
+    assert read_printer(tmp_path / "config.g").radius == 105
+    (tmp_path / "config.g").write_text(text + line + "\n")
+    with pytest.raises(InputError) as caught:
+        read_printer(tmp_path / "config.g")
+    assert "line 4" in caught.value.where
+    assert f"Send {line.split()[0]} " in caught.value.next_step

@@ -8,12 +8,14 @@ import re
 import numpy as np
 import pytest
 
+import pkmcal
 import printers
 from conftest import run
 from export_sources import source_of
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.firmware.contract import firmwares
 from pkmcal.mechanisms import machine_from_document
+from pkmcal.outcome.finding import Level
 from test_export_firmware import ideal_linear, ideal_rotary
 
 ENTRIES = {"height_offset": 0.001, "steps_per_mm": 3 * (80.0,)}
@@ -111,3 +113,59 @@ def test_the_command_shows_them(tmp_path):
     source = load_source(kit / "calibration")
     # a mean of fifteen heights, each to 0.02 mm by default
     assert source.bed_sigma == pytest.approx(20e-6 / np.sqrt(15), rel=0.05)
+
+
+def weak_session(folder, part):
+    """Session of seven heights, and of three distances beside them."""
+    (folder / "printer.cfg").write_text(printers.calibrated_cfg())
+    more = []
+    if part:
+        marks = {"m": (0, 0), "a": (60, 0), "b": (-30, 52), "c": (-30, -52)}
+        lines = ["unit: mm", "marks:", *(f"  {k}: [{x}, {y}, 0.3]" for k, (x, y) in marks.items())]
+        lines += ["distances:", *(f"  - {{between: [m, {k}], apart: 60.1}}" for k in "abc")]
+        (folder / "part.yaml").write_text("\n".join(lines) + "\n")
+        more = ["--part", folder / "part.yaml"]
+    run("new", folder / "kit", "--printer", folder / "printer.cfg", *more)
+    return folder / "kit"
+
+
+@pytest.mark.parametrize("part", [False, True], ids=["heights", "heights and distances"])
+def test_values_that_the_nominal_model_decides_are_named(tmp_path, part):
+    """In the table, in a finding and in the file; the values that the data determine are not."""
+    kit = weak_session(tmp_path, part)
+    run("calibrate", kit)
+    exported = pkmcal.export(kit / "calibration", "marlin", force=True)
+    rods = {"M665 L", "M665 A", "M665 B", "M665 C"}
+    by_nominal = {one.name for one in exported.values if one.by_nominal}
+    assert by_nominal
+    assert by_nominal <= rods
+    (finding,) = (one for one in exported.notes if one.code == "export.by_nominal")
+    assert finding.level is Level.DOUBTFUL
+    assert set(finding.facts["names"]) == by_nominal
+    # share of the variance that the prior sigma of 0.5 mm leaves
+    least = min(exported.values, key=lambda one: 1.0 if one.data_share is None else one.data_share)
+    assert 0 <= least.data_share < 0.5
+    (text,) = exported.contents().values()
+    first, *lines = text.splitlines()
+    assert all(name in first for name in by_nominal)
+    named = [line for line in lines if line.startswith("; M665") and "nominal model" in line]
+    assert len(named) == len(by_nominal)
+    assert {one.name: one.data_share > 0.9 for one in exported.values if "R" in one.name} == {
+        "M665 R": True
+    }
+
+
+def test_values_that_the_file_fixes_have_no_share_of_the_data(tmp_path):
+    kit = weak_session(tmp_path, part=False)
+    mechanism = kit / "mechanism.yaml"
+    text = mechanism.read_text()
+    assert 'fixed: ["legs' in text
+    mechanism.write_text(
+        text.replace('fixed: ["legs', 'fixed: ["legs[*].length.constant", "legs', 1)
+    )
+    run("calibrate", kit)
+    values = pkmcal.export(kit / "calibration", "klipper").values
+    by_name = {one.name: one for one in values}
+    assert by_name["stepper_a.arm_length"].data_share is None
+    assert by_name["delta_radius"].data_share > 0.9
+    assert not any(one.by_nominal for one in values)

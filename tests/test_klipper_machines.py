@@ -91,6 +91,16 @@ def test_defaults_and_includes_of_a_rotary_delta(tmp_path):
     np.testing.assert_allclose(centers, want, atol=1e-6)
 
 
+def test_anchors_in_metres_are_named(tmp_path):
+    text = WINCH
+    for x in {abs(value) for anchor in ANCHORS for value in anchor} - {0}:
+        text = text.replace(f"{x}\n", f"{x / 1000}\n")
+    with pytest.raises(InputError) as caught:
+        model(text, tmp_path)
+    assert "3 mm" in caught.value.found
+    assert "1000" in caught.value.next_step
+
+
 def test_a_winchs_cables_lead_to_the_nozzle(tmp_path):
     machine, texts = model(WINCH, tmp_path)
     points = np.array([[0, 0, 0], [300, -200, 500.0], [-400, 100, 50]])

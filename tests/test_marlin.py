@@ -337,6 +337,31 @@ def test_a_grid_has_the_places_of_its_command(tmp_path):
     assert np.linalg.norm(probe[:, :2], axis=1).max() > 60
 
 
+@pytest.mark.parametrize(("size", "most"), [("120", 90), ("121.9", 90), ("128", 90), ("120", None)])
+def test_a_square_grid_is_read_where_the_print_radius_holds_it(size, most, tmp_path):
+    """G29 H: Marlin cuts a larger square at the probe's reach without a mark."""
+    half = int(float(size)) // 2
+    low, high = -half, int(float(size)) - half
+    x = np.linspace(low, high, 5)
+    there = np.stack(np.meshgrid(x, x), axis=-1)
+    text = grid_lines(1e-3 * there[..., 0] + 2e-3 * there[..., 1], f"G29 H{size}")
+    printer = replace(
+        read_printer(text_file(tmp_path, CONFIGURATION, "Configuration.h")), reach=most
+    )
+    log = text_file(tmp_path, text, "log.txt")
+    if most is None or np.sqrt(2) * half > most:
+        with pytest.raises(InputError) as caught:
+            read_measured(log, printer)
+        assert "G29 L R F B" in caught.value.expected
+        return
+    touches, _ = read_measured(log, printer)
+    true = printers.Settings(105.0, tuple(printer.angle), tuple(printer.rod))
+    tool = 1e3 * printers.machine(true).forward(1e-3 * touches.carriages)[:, :3, 3]
+    probe = tool + np.array([10, -20, 0])
+    np.testing.assert_allclose(probe[:, 2], probe[:, :2] @ [1e-3, 2e-3], atol=6e-4)
+    assert probe[:, 0].min() == pytest.approx(low, abs=1e-6)
+
+
 G33 = """\
 Send: G33 P3 V0
 Recv: G33 Auto Calibrate
@@ -369,6 +394,20 @@ def test_a_dry_run_of_g33_has_seven_places(command, offset, tmp_path):
     np.testing.assert_allclose(
         mine[np.lexsort(np.round(mine, 6).T)], np.array(want)[order], atol=1e-6
     )
+
+
+def test_a_g33_that_prints_no_radius_has_that_of_m665(tmp_path):
+    """B of M665 up to 2.0.5; beside A and C it is a rod's trim, and no radius."""
+    printer = read_printer(text_file(tmp_path, OLDER.replace("Z-16", "X0 Y0 Z-16")))
+    silent = without(G33, " at radius:80.00")
+    same = [
+        read_measured(text_file(tmp_path, text, "log.txt"), printer)[0].carriages
+        for text in (G33, OLDER + silent)
+    ]
+    np.testing.assert_allclose(*same)
+    for text in (silent, M503 + silent):
+        with pytest.raises(InputError):
+            read_measured(text_file(tmp_path, text, "log.txt"), printer)
 
 
 def test_m48_is_the_noise(tmp_path):

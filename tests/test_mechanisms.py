@@ -353,8 +353,8 @@ def test_carriers_broadcast(side, carrier):
             "name: small\nmotion: planar",
             "nam: small\nmotoin: planar",
             "m.yaml, line 1, nam: this key is not known; found nam, expected name (known here: "
-            "fixed, height_offset, home, legs, models, motion, name, steps_per_mm, tied, "
-            "tolerance, workspace_radius). "
+            "fixed, growth, height_offset, home, legs, load, models, motion, name, steps_per_mm, "
+            "tied, tolerance, workspace_radius). "
             "Then look at line 2, "
             "motoin.",
         ),

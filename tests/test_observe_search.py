@@ -134,6 +134,28 @@ def rough_pose(seed, degrees=10.0, distance=0.1):
     return inverse(inverse(FRONT) @ pose(rotation(turn), shift))
 
 
+def test_an_image_edge_is_evidence_for_one_of_two_legs_behind_each_other():
+    """Leg 1 moved to where leg 0 is seen, further from the camera: their edges coincide."""
+    view = view_of(images()[:2])
+    apart = view.legs(np.arange(2))
+    a, b = apart.a.copy(), apart.b.copy()
+    eye = inverse(FRONT)[:3, 3]
+    a[:, 1], b[:, 1] = (eye + 1.02 * (end[:, 0] - eye) for end in (a, b))
+    behind = replace(view, guessed=replace(apart, a=a, b=b, u=(b - a) / norm(b - a))[None])
+    before, after = (
+        pose_likelihood.coinciding_edges(v, FRONT[None], np.arange(2), 8).reshape(2, -1, 8)
+        for v in (replace(view, guessed=apart[None]), behind)
+    )
+    leg = view.tubes.leg
+    assert np.median(before[:, np.isin(leg, [0, 1])]) == 1
+    assert np.mean(after[:, np.isin(leg, [0, 1])] == 2) > 0.8
+    assert np.array_equal(after[:, leg > 1], before[:, leg > 1])
+
+
+def norm(vectors):
+    return np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def view_of(pictures, mechanism=None, in_view=None):
     mechanism = mechanism or machine()
     in_view = poses() if in_view is None else in_view

@@ -123,6 +123,7 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
             "extreme": Range(0, 1),
             "breathing": Range(0, 1),
             "shake": Range(0, 1),
+            "warming": Range(0, 200, default=0.0),
             "seed": _SEED,
         },
         "study": {"runs": _whole(2, 1_000_000, 100), "seed": _SEED},

@@ -13,8 +13,8 @@ from pkmcal.api.result import Result
 from pkmcal.calibration.machine_source import MachineSource, load_source
 from pkmcal.exporters.contract import Export, exporter_of, make_export, write_export
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
-from pkmcal.outcome.finding import note
-from pkmcal.wording import brief, decimals, number
+from pkmcal.outcome.finding import Level, note
+from pkmcal.wording import brief, decimals, number, percent
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ class ExportResult(Result, Export):
         for one in self.values:
             if one.sigma is not None:
                 sigma = brief(one.sigma) if one.sigma else "exact"
-                rows.append(
-                    Row(one.name, (number(one.value, decimals(one.sigma)), sigma, one.unit))
-                )
+                share = "" if one.data_share is None else percent(one.data_share)
+                cells = (number(one.value, decimals(one.sigma)), sigma, one.unit, share)
+                rows.append(Row(one.name, cells, mark=Level.DOUBTFUL if one.by_nominal else None))
         if not rows:
             return ()
-        columns = ("Name", "Value", "σ", "Unit")
+        columns = ("Name", "Value", "σ", "Unit", "By the data")
         return (Part("values", "Values", tables=(Table("", columns, tuple(rows), words=(3,)),)),)
 
     def _document(self) -> dict[str, Any]:

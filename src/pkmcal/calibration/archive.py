@@ -52,7 +52,7 @@ def keep_earlier(
 
 
 def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes], page: str) -> bool:
-    """Whether the new result equals the one in the folder, apart from the page made from it."""
+    """Whether the new result equals the result in the folder; the rendered page is not compared."""
     if {*names} - {page} != {*texts} - {page} or not _regular(folder, names):
         return False
     return all(

@@ -52,6 +52,7 @@ from pkmcal.calibration.localization import (
 from pkmcal.calibration.model_violations import DetectedViolation, model_violations
 from pkmcal.calibration.outlier_explanations import outlier_explanations
 from pkmcal.calibration.pose_hypotheses import explain_closure, explain_poses
+from pkmcal.calibration.reading_effects import effect_notes, with_estimated_effects
 from pkmcal.calibration.refinement import (
     REFINEMENT,
     RefinementOptions,
@@ -62,7 +63,6 @@ from pkmcal.calibration.refinement import (
 )
 from pkmcal.calibration.rejections import rejection_findings, unused_configurations
 from pkmcal.calibration.summary import CalibrationSummary, Overview
-from pkmcal.calibration.thermal_growth import growth_notes
 from pkmcal.calibration.tube_radii import explain_radii
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import closest, quoted, resolved
@@ -100,16 +100,18 @@ CALIBRATION_METHODS: tuple[str, ...] = get_args(CalibrationMethod)
 
 @dataclass(frozen=True, repr=False)
 class Calibration(CalibrationSummary):
-    """The result of a calibration.
+    """Result of a calibration.
 
-    boards : the calibration board, where stations observe one. identification : identifiability of
-    the machine's parameters. timings : seconds by step. holdout : configurations that the estimate
-    does not use, where requested; :func:`pkmcal.judge.holdouts.holdout_of` predicts them.
-    violations :
-    detected model violations. model_errors : smooth model errors without a name, which the
-    covariance contains. upside_down : images that were measured by their camera turned by half.
-    images : images of stations whose legs were observed, by the station's number; those that
-    fitted into memory are decoded.
+    boards : calibration board, where stations observe one.
+    identification : identifiability of the machine's parameters.
+    timings : seconds by step.
+    holdout : configurations that the estimate does not use, if requested;
+        :func:`pkmcal.judge.holdouts.holdout_of` predicts them.
+    violations : detected model violations.
+    model_errors : smooth model errors without a name, which the covariance contains.
+    upside_down : images that were measured with their camera rotated by half a turn.
+    images : images of stations whose legs were observed, by the station's number; those that fitted
+        into memory are decoded.
     """
 
     session: Session
@@ -140,7 +142,7 @@ class Calibration(CalibrationSummary):
         return probed_heights(self.session, self.measurements, self.estimate)
 
     def overview(self) -> Overview:
-        """The figures of its summary."""
+        """Contents of the summary."""
         session, e = self.session, self.estimate
         edges, poses = e.edge_residuals[e.edge_weights >= INLIER_WEIGHT], e.pose_residuals
         return Overview(
@@ -178,14 +180,15 @@ def calibrate_session(
     session : a loaded session, or its folder.
     method : ``bundle`` (joint maximum likelihood), ``four-step`` ([A]), ``linear`` ([B]) or
         ``inverse-kinematic`` ([C]).
-    seed : for the random search for the stations' poses.
-    refine_camera : estimate the cameras' intrinsics with the machine, from their calibration's
-        covariance on.
+    seed : seed for the random search for the stations' poses.
+    refine_camera : estimate the cameras' intrinsics with the machine, with their calibration's
+        covariance as the prior.
     holdout : number of poses, spread over the workspace, that the estimate does not use and that
         test the result.
     progress : called with the step in words and the share done.
-    options : of the measurement passes. case : the session with its images localized; by default
-        they are localized here.
+    options : of the measurement passes.
+    case : session with its images localized; by default they are localized here.
+
     Raises InputError where the session is at fault, ResultError where there is no estimate.
     """
     from threadpoolctl import threadpool_limits
@@ -215,13 +218,13 @@ def calibrate_session(
 def better_refined(
     refined: Callable[[], Calibration], held: Callable[[], Calibration]
 ) -> Calibration:
-    """The calibration with the cameras' intrinsics estimated, unless the one with those of the
-    files is better; a warning then says so.
+    """Calibration with the cameras' intrinsics estimated, unless the one with those of the files is
+    better.
 
-    Estimated intrinsics can be wrong where images are few or without a sure pose. A usable result
-    is better, then one with more images, then one that fits its data better beyond chance, which
-    additional unknowns do not by themselves. Raises the error of ``refined`` where neither has a
-    result.
+    In the latter case the result has a warning. Estimated intrinsics can be wrong if there are few
+    images, or images with an uncertain pose. Criteria, in this order: a usable result; more images
+    in use; a significantly smaller chi2 per degree of freedom, to which additional unknowns
+    contribute nothing by themselves. Raises the error of ``refined`` if neither has a result.
     """
     try:
         value = refined()
@@ -242,7 +245,7 @@ def better_refined(
 
 
 def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
-    """A warning where a calibration with estimated intrinsics is worse than one with those of the
+    """Warning if a calibration with estimated intrinsics is worse than one with those of the
     files.
     """
     if refined.verdict.usable != held.verdict.usable:
@@ -280,11 +283,13 @@ def calibrate_measurements(
     *,
     progress: Progress = no_progress,
 ) -> Calibration:
-    """Calibrate the machine of a session from edges that are given, such as simulated ones.
+    """Calibrate the machine of a session from given edges, such as simulated ones; no image is
+    read.
 
-    No image is read. observation : with the edges of ``measurements``, whose readings may be others
-    than the session's. T_camera_base : (S, 4, 4) from where the estimate starts. Raises ResultError
-    where there is no estimate.
+    observation : with the edges of ``measurements``, whose readings may differ from the session's.
+    T_camera_base : (S, 4, 4) start of the estimate.
+
+    Raises ResultError where there is no estimate.
     """
     clock = Clock(progress)
     start = start_state(session.machine, measurements, T_camera_base)
@@ -312,11 +317,13 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
 
 
 class Settled(NamedTuple):
-    """A repaired session and its estimate, which no hypothesis explains better.
+    """Repaired session and its estimate, after no remaining hypothesis is decided for.
 
-    stated : the estimate with the readings' noise as stated. repairs : that were made, the data
-    otherwise than stated. findings : on repairs, on hypotheses that are likely but not decided for,
-    and on those that could not be tested.
+    stated : estimate with the readings' noise as stated.
+    richer : another model of the mechanism file that explains the poses, if any.
+    repairs : hypotheses by which the data were changed.
+    findings : on repairs, on hypotheses that are likely but were not adopted, and on hypotheses
+        that could not be tested.
     """
 
     case: Case
@@ -335,20 +342,23 @@ def settle(
     clock: Clock,
     options: RefinementOptions = REFINEMENT,
 ) -> Settled:
-    """All that decides whether a session can be calibrated: `calibrate` goes on from it, and
-    `check` ends with it.
+    """Localize, estimate and compare all hypotheses about a session, until no repair is decided
+    for.
 
-    All hypotheses are compared with the data as stated. A repair changes the data, so after each
-    one the machine is localized and estimated, and all hypotheses are compared, again; each repair
-    concerns a camera's file or a station that no later one concerns, which bounds their number.
-    Raises `InputError`, the likeliest mistake, or `ResultError` where there is no estimate.
+    `calibrate` continues from the result; `check` ends with it. Hypotheses are compared with the
+    data as stated. A repair changes the data, so after each one the machine is localized and
+    estimated, and all hypotheses are compared again. Each camera's file is repaired once at most,
+    and stations are only removed, which bounds the number of repetitions.
 
-    case : of the session.
+    case : observations of the session.
+
+    Raises `InputError` for the most likely error in the input, `ResultError` where there is no
+    estimate.
     """
     repairs: list[Ranked[UpsideDown]] = []
     while True:
         now, clock = clock.part(0, 0.8), clock.part(0.8, 1)
-        # mistakes in the readings, without which no estimate means anything
+        # errors in the readings first: with one of them, no estimate is valid
         refuse(partial(explain_closure, case.session, case.boards))
         try:
             turns = _identify(case, refine_camera, now.part(0, 0.9), options)
@@ -358,8 +368,8 @@ def settle(
                 partial(explain_radii, case, None, refine_camera, seed),
             )
             raise
-        # images that are upside down; all stations begin anew, for one that was rejected before
-        # may have been upside down, too
+        # images that are upside down; all stations are localized again, because one that was
+        # rejected before may have been upside down too
         files = {one.hypothesis.subject for one in repairs}
         rotations = [
             one for one in upside_down(case.session, turns) if one.hypothesis.subject not in files
@@ -371,14 +381,14 @@ def settle(
                 repaired = one.hypothesis.apply(repaired)
             case = observed_case(repaired, seed, now.part(0.9, 1))
             continue
-        # stations that are not where they were localized
+        # stations with a wrong localized pose
         wrong = misplaced_stations(case.session, turns) or inconsistent_poses(
             case.session, turns.measurements, turns.estimate, case.scene.T_camera_base
         )
         if not wrong:
             break
         case = without_misplaced(case, wrong, turns.measurements.edges, turns.estimate)
-    # mistakes that a user has to correct
+    # errors that only the user can correct
     now.progress("Testing hypotheses about the data", 0.9)
     stated = refit_fixed_noise(case.session.machine, turns.measurements, turns.estimate)
     richer, failed = richer_model(case.session, turns.measurements, stated)
@@ -396,7 +406,7 @@ def settle(
 def _finished(
     settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
 ) -> Calibration:
-    """The calibration of a session after all repairs."""
+    """Calibration of a session after all repairs."""
     case, turns, stated, richer, repairs, found = settled
     machine = case.session.machine
     turns = imputation_variance(case, turns, np.random.default_rng(0), clock.part(0, 0.85).progress)
@@ -410,7 +420,7 @@ def _finished(
 
 
 class _Identified(NamedTuple):
-    """The refinement, the estimate by the requested method, the richer model, the holdout."""
+    """Refinement, estimate by the requested method, richer model, and holdout."""
 
     turns: RefinementResult
     estimate: Estimate
@@ -421,7 +431,7 @@ class _Identified(NamedTuple):
 def _load(
     session: Session | Path | str, refine_camera: bool, holdout: int, clock: Clock
 ) -> Session:
-    """The loaded session, checked for what this observation can use."""
+    """Loaded session, checked for conflicts with the options."""
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
@@ -437,12 +447,12 @@ def _load(
 
 
 def observed_case(session: Session, seed: int, clock: Clock) -> Case:
-    """The case of a session with its stations localized, without hand-held images that could not be
-    placed.
+    """Case of a session with its stations localized, without hand-held images that were not
+    localized.
 
     seed : for the random search. Raises as :func:`calibrate_session`.
     """
-    clock.progress("Reading images", 0.0)
+    clock.progress("Reading images" if session.stations else "Reading the measurements", 0.0)
     images = read_images(session)
     clock.lap("decode")
     if any("board" in station.observe for station in session.stations):
@@ -478,7 +488,7 @@ def _estimated(
     holdout: int,
     clock: Clock,
 ) -> _Identified:
-    """The estimate without the holdout, by a paper's method if requested.
+    """Estimate without the holdout, by a paper's method if requested.
 
     Configurations are held out only here, after the localization, which needs all images.
     """
@@ -509,7 +519,7 @@ def _judge(
 ) -> Calibration:
     """Verdict on an estimate: model violations, identifiability and all findings.
 
-    repairs : that were made. found : on hypotheses, see :class:`Settled`.
+    repairs, found : see ``repairs`` and ``findings`` of :class:`Settled`.
     """
     clock.progress("Judging", 0.9)
     session, turns = _as_measured(case.session, value.turns), value.turns
@@ -517,11 +527,13 @@ def _judge(
     errors: tuple[ModelError, ...] = ()
     uneven: tuple[Column, ...] = ()
     without = value.estimate
-    if method == "bundle":  # the papers' methods end at no minimum of the joint problem
+    # score tests need the minimum of the joint problem, where the papers' methods do not end
+    if method == "bundle":
         detections, errors, estimate, uneven = model_violations(
             session, turns.observation, turns.measurements, value.estimate
         )
-        value = value._replace(estimate=estimate)
+        value = value._replace(estimate=with_estimated_effects(session, estimate))
+    # identifiability, and findings other than those of the verdict
     identification = _identification(turns.measurements, without, uneven)
     others = (
         *_findings_of_estimate(
@@ -563,7 +575,7 @@ def _judge(
 
 
 def _as_measured(session: Session, turns: RefinementResult) -> Session:
-    """The session with the cameras and responses by which its images were measured in the end."""
+    """Session with the cameras and responses with which its images were finally measured."""
     stations = session.stations
     if turns.cameras.active:  # the edges are where these cameras see them
         stations = tuple(
@@ -585,10 +597,10 @@ def _findings_of_estimate(
     errors: tuple[ModelError, ...],
     at_minimum: bool,
 ) -> Iterator[Finding]:
-    """Findings about an estimate beside those of the verdict.
+    """Findings about an estimate other than those of the verdict.
 
-    detections, errors : model violations, and smooth model errors without a name. at_minimum :
-    whether the estimate is the minimum of the joint problem.
+    detections, errors : model violations, and smooth model errors without a name.
+    at_minimum : whether the estimate is the minimum of the joint problem.
     """
     turns, estimate, measurements = value.turns, value.estimate, value.turns.measurements
     uneven_bed = explains_heights(errors)
@@ -609,7 +621,7 @@ def _findings_of_estimate(
     yield from noise_notes(session, estimate, named, explained=uneven_bed)
     yield from lens_notes(turns.cameras)
     yield from size_notes(session, measurements, estimate)
-    yield from growth_notes(session, estimate)
+    yield from effect_notes(session, estimate)
     yield from scale_notes(session, estimate, tuple(one.of for one in detections))
 
 
@@ -618,7 +630,7 @@ def _identification(
 ) -> Identification:
     """Identifiability of the machine's parameters, in words, and the papers' conditions.
 
-    uneven : the model discrepancy, which bends a bed.
+    uneven : columns of the model discrepancy, which for heights is an uneven bed.
     """
     observed = observed_legs(
         measurements.edges,
@@ -640,7 +652,7 @@ def _identification(
 
 @dataclass(frozen=True)
 class Clock:
-    """Progress of a step, and the seconds by step, each of which may have several laps."""
+    """Progress of a task, and the seconds by step; a step may have several laps."""
 
     progress: Progress = no_progress
     laps: dict[str, float] = field(default_factory=dict)

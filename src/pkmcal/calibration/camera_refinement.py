@@ -1,8 +1,9 @@
 """Measurements of a session as one set, and the refinement of its cameras.
 
-The intrinsics of a refined camera are those of its calibration plus F u: F F^T is the calibration's
-covariance, and the u are unknowns of the estimate with unit variance. The focal lengths of images
-by hand breathe besides: those of each image exceed its camera's by an unknown of its own.
+The intrinsics of a refined camera are those of its calibration plus F u, where F F^T is the
+calibration's covariance, and u are unknowns of the estimate with unit variance. The focal length of
+a hand-held camera changes with the focus ("breathing"): each of its images has an unknown relative
+excess of the focal lengths.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.thermal_growth import thermal_effects
+from pkmcal.calibration.reading_effects import effects_of_session
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import Estimate
@@ -36,11 +37,11 @@ class CameraRefinement:
     """Cameras of a session, and the present state of their refinement.
 
     files, calibrated : names and cameras as calibrated, C of them.
-    factor : (C, n, r) the F above, r = 0 where cameras are held.
-    at : (C, r) the u.
+    factor : (C, n, r) F, r = 0 where cameras are held.
+    at : (C, r) u.
     of_station : (S,) file of each station's camera.
-    breathes : (S,) whether the station is an image by hand.
-    breath : (S,) excess of its focal lengths, relative.
+    breathes : (S,) whether the station is a hand-held image.
+    breath : (S,) relative excess of its focal lengths.
     """
 
     files: tuple[str, ...]
@@ -65,7 +66,7 @@ class CameraRefinement:
 
     @property
     def active(self) -> bool:
-        """Whether there is anything to refine, of a camera or of an image."""
+        """Whether intrinsics of a camera, or the focal length of an image, are refined."""
         return self.refined or bool(self.breathes.any())
 
     def camera(self, file: str) -> Camera:
@@ -77,7 +78,7 @@ class CameraRefinement:
         return replace(camera, parameters=camera.parameters + change)
 
     def at_station(self, number: int) -> Camera:
-        """Camera of a station, with its own focal lengths where these breathe."""
+        """Camera of a station, with the focal lengths of its image if it is hand-held."""
         camera = self.camera(self.of_station[number])
         excess = self.breath[number] * camera.focal_part
         return replace(camera, parameters=camera.parameters + excess)
@@ -120,10 +121,11 @@ class CameraRefinement:
 def edges_by_camera(observation: Observation, cameras: Sequence[Camera]) -> Array:
     """Derivative (N, 2, n) of the measured normals by their camera's parameters, at fixed pixels.
 
-    cameras : (S,) of the stations that have one, which come first; n of the widest.
+    A plane that contains the rays r has ``r . n = 0``; as rays rotate by dr, ``r . dn = -n . dr``,
+    in least squares over the pixels that support an edge.
 
-    A plane that holds the rays r has ``r . n = 0``; as rays rotate by dr, ``r . dn = -n . dr``,
-    least squares over the pixels that support an edge.
+    cameras : (S,) of the stations that have one, which come first; n parameters of the widest
+        model.
     """
     edges, at = observation.edges, observation.point_edge
     widest = max((len(camera.parameters) for camera in cameras), default=0)
@@ -172,8 +174,10 @@ def refinement_of(session: Session, refine: bool) -> CameraRefinement:
 
 
 def covariance_root(camera: Camera) -> Array:
-    """F (n, r) of a camera; parameters that its calibration held have no variance and no column. A
-    camera whose file states no covariance has a usual one.
+    """Root F (n, r) of a camera's covariance.
+
+    Parameters that its calibration held have no variance and no column. A camera whose file states
+    no covariance has a default one.
     """
     stated = camera.covariance
     covariance = camera.usual_covariance() if stated is None else stated
@@ -189,14 +193,17 @@ def measurements_of(
     boards: Boards,
     edges: EdgeSet | None = None,
     cameras: CameraRefinement | None = None,
+    estimate: Estimate | None = None,
 ) -> Measurements:
     """Measurements of a session's images and tables, by the present cameras.
 
-    cameras : None for the first, coarse estimate, which cannot refine any.
+    cameras : None for the first, coarse estimate, which cannot refine any. estimate : an earlier
+    one, by which effects on the readings are; by the nominal machine without it.
     """
     # Mounts: the board, then each tracker's target, then the points of links.
     mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
     poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
+    # Changes of the cameras so far: poses are transformed to first order.
     focal_at = np.zeros(0)
     if cameras is not None and cameras.active and session.stations:
         if cameras.breathes.any():
@@ -208,6 +215,7 @@ def measurements_of(
         ]
         widest = max(len(part) for part in change)
         poses = poses.transform(np.stack([np.pad(x, (0, widest - len(x))) for x in change]))
+    # Trackers and links, each with a mount of its own.
     sets = [poses]
     for k, table in enumerate(session.trackers, start=len(session.stations)):
         sets.append(table.poses(k, len(mounts)))
@@ -216,16 +224,17 @@ def measurements_of(
     for one in session.links:
         links.append(one.at_mount(len(mounts)))
         mounts.append(Mount(one.kind, "platform"))
+    effects = effects_of_session(session, estimate)
     measurements = Measurements(
         edges=edges,
-        joints=session.joints,
+        joints=sum((effect.correction for effect in effects), session.joints),
         joint_noise=session.joint_noise,
         n_stations=len(session.station_names),
         camera_of_station=session.camera_of_station,
         poses=concatenate(sets),
         mounts=tuple(mounts),
         links=tuple(links),
-        effects=thermal_effects(session),
+        effects=effects,
         level=np.array(
             [False] * len(session.stations) + [table.level for table in session.trackers],
             dtype=bool,
@@ -252,10 +261,10 @@ def _with_focal(measured: Set, cameras: CameraRefinement) -> Set:
 
 
 def by_focal(by: Array, station: Integers, cameras: Sequence[Camera | None]) -> Array:
-    """Derivative (N, d) of measurements by the relative excess of the focal lengths, from that by
-    their camera's parameters ``by`` (N, d, n).
+    """Derivative (N, d) of measurements by the relative excess of the focal lengths.
 
-    station : (N,); zero for stations without a camera.
+    by : (N, d, n) derivative by the parameters of their camera.
+    station : (N,); the result is zero for stations without a camera.
     """
     focal = np.zeros((int(station.max(initial=-1)) + 1, by.shape[-1]))
     for k, camera in enumerate(cameras[: len(focal)]):

@@ -1,12 +1,13 @@
-"""The hypothesis that images have another response than files of their kind, by the score test.
+"""Hypothesis that images have another response than is usual for their kind of file, by a score
+test.
 
-A file's kind has a usual response: linear, or the sRGB curve. Under the wrong response blurred
-edges are displaced to their dark side, each by its own contrast, as no machine displaces them. So
-the change from the edges by one response to those by the other is a column of one number
-(:mod:`pkmcal.identify.score`), whose estimate is 0 where the first response is right. A few images
-by themselves show whether anything is to be gained, except with polished legs. If so, all images
-are measured by the other response as well, and the one from which the change to the other gains
-less is right.
+A kind of file has a usual response: linear, or the sRGB curve. With a wrong response, blurred edges
+are displaced to their dark side, each by its own contrast, which no change of the machine
+reproduces. So the change from the edges by one response to those by the other is a column of one
+number (:mod:`pkmcal.identify.score`), whose estimate is 0 if the first response is right. First a
+few images are tested; they decide unless legs are polished. If they prefer the other response, or
+do not decide, all images are measured by the other response as well, and the response from which
+the change to the other gains less chi2 is right.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
 RESPONSE_TEST_CONFIGURATIONS = 6
-"""Configurations of a camera whose images are tested first: with painted legs their hundred and
-fifty edges show a wrong response by six standard deviations."""
+"""Number of configurations of a camera whose images are tested first: with painted legs their
+hundred and fifty edges detect a wrong response at six standard deviations."""
 LEAST_RESPONSE_GAIN, MOST_TURN_DEVIATION = 2.7, 0.1
-"""chi2 from which all images are measured by the other response, by chance in one session of ten;
-and the standard deviation of the change from which few images do not determine it."""
+"""Decrease of chi2 above which all images are measured by the other response (exceeded by chance in
+one session of ten), and standard deviation of the change above which few images do not decide."""
 _Camera = tuple[str, Response]
-"""A camera's file, and the usual response of its images' kind."""
+"""A camera's file, and the usual response of its kind of image file."""
 
 
 ResponseHypothesis = Hypothesis[Session]
@@ -80,7 +81,7 @@ def _with_response(session: Session, entries: tuple[str, ...], response: Respons
 
 class ResponseComparison(NamedTuple):
     """Cameras whose images may have another response than usual, with their log-odds, and notes on
-    those that could not be compared.
+    cameras that could not be compared.
     """
 
     ranked: tuple[Ranked[ResponseHypothesis], ...] = ()
@@ -88,7 +89,7 @@ class ResponseComparison(NamedTuple):
 
     @property
     def repairs(self) -> tuple[ResponseHypothesis, ...]:
-        """Hypotheses by which images are measured."""
+        """Hypotheses that are decided for: their responses are used for the measurement."""
         return tuple(one.hypothesis for one in self.ranked if decide([one]))
 
     @property
@@ -120,14 +121,19 @@ def responses_by_edges(
     measured: Callable[[list[StationImages]], EdgeSet],
     of_edges: Callable[[EdgeSet], Measurements],
 ) -> ResponseComparison:
-    """Cameras without a response in session.yaml whose edges are against the usual one, or do not
-    decide. The evidence is the gain of chi2 by the change to the other response, less that of the
-    change back.
+    """Compare the usual with the other response, for cameras without a response in session.yaml.
 
-    measurements, estimate : by the usual responses. roughly, measured : edges of images, searched
-    where those of ``measurements`` were, with the same blur or with their own. of_edges :
-    measurements with these edges instead.
+    The log-likelihood ratio is half the decrease of chi2 by the change to the other response, minus
+    half that by the change back.
+
+    measurements, estimate : by the usual responses.
+    roughly, measured : functions that measure the edges of images at the predictions of
+        ``measurements``, with the same blur, or with a blur of their own.
+    of_edges : function that returns the measurements with other edges.
+
+    Returns cameras whose edges prefer the other response, or do not decide.
     """
+    # images by camera, where session.yaml does not state the response
     usual: dict[_Camera, list[StationImages]] = {}
     for p in images:
         station = session.stations[p.station]
@@ -140,10 +146,11 @@ def responses_by_edges(
         edges = measurements.edges
         own = {x: np.isin(edges.station, [p.station for p in usual[x]]) for x in questionable}
         every = {camera: measured(_otherwise(usual[camera])) for camera in questionable}
-        # in the dark a wrong response leaves hardly an edge
+        # in dark images hardly an edge is measurable with a wrong response
         every = {x: e for x, e in every.items() if len(e) > MAJORITY * own[x].sum()}
         if not every:
             return ResponseComparison()
+        # change to the other response, and back from an estimate with it
         there, _ = _scored(measurements, estimate, every)
         stay = ~np.any([own[camera] for camera in every], axis=0)
         new = concatenate([edges.select(stay), *every.values()])
@@ -179,14 +186,17 @@ def _questionable(
     usual: Mapping[_Camera, Sequence[StationImages]],
     roughly: Callable[[list[StationImages]], EdgeSet],
 ) -> list[_Camera]:
-    """Cameras all of whose images are to be measured by the other response: a few images gain by
-    it, or do not determine the change, as with polished legs.
+    """Cameras all of whose images have to be measured by the other response.
+
+    Those in which a few images prefer the other response, or do not determine the change, as with
+    polished legs.
     """
     if estimate.edge_noise.shading.max() > POLISHED_SHADING:
         return list(usual)
     queries = {camera: _test_images(mine) for camera, mine in usual.items()}
     few = {x: roughly(_otherwise(_select(usual[x], some))) for x, some in queries.items()}
-    # edges of the same machine that stay where they are would hold these back
+    # edges of the tested cameras outside the tested images do not change: they would oppose the
+    # change, so they have no weight
     weight = np.where(_edge_mask(measurements.edges, usual, queries), estimate.edge_weights, 0.0)
     gains, ways = _scored(measurements, replace(estimate, edge_weights=weight), few)
     return [
@@ -236,7 +246,7 @@ def _edge_mask(
 def _scored(
     measurements: Measurements, estimate: Estimate, other: Mapping[_Camera, EdgeSet]
 ) -> tuple[dict[_Camera, float], dict[_Camera, float]]:
-    """Gain of chi2 by the change to other edges, for the edges of each camera, and the standard
+    """Decrease of chi2 by the change to other edges, for the edges of each camera, and the standard
     deviation of that change.
     """
     turns = [_normal_turn(measurements.edges, edges) for edges in other.values()]
@@ -250,8 +260,11 @@ def _scored(
 
 
 def _normal_turn(edges: EdgeSet, other: EdgeSet) -> Array:
-    """Turn (N, 2, 1) of the edges' normals, in their bases, to those of another measurement pass;
-    zero for edges that it lacks and for coarse ones, which no response moves.
+    """Rotation (N, 2, 1) of the edges' normals, in their bases, to those of another measurement
+    pass.
+
+    Zero for edges that the other pass lacks, and for coarse ones, which do not depend on the
+    response.
     """
     mine, theirs = edges.same_as(other)
     both = ~edges.coarse[mine] & ~other.coarse[theirs]

@@ -1,12 +1,11 @@
 """Test of measured edges against chance matches.
 
-Some image edge is within reach of any predicted edge. If another machine than that in the images
-is localized all the same, a tenth of its edges are matched by chance, and the joint estimate makes
-these agree, with large standard deviations. Where few of the edges in sight were measured, they are
-measured again with the images shifted, in several directions: no leg is then at its predicted
-place, so all matches are by chance. This is an absolute test, which no likelihood ratio between
-explanations replaces. Its level is that of the localization: the probability with which a wrong
-pose is accepted.
+Some image edge is within reach of any predicted edge. If a machine is localized that is not in the
+images, a tenth of its edges are matched by chance, and the joint estimate reconciles these, with
+large standard deviations. If few of the visible edges were measured, they are measured again with
+the images shifted, in several directions: no leg is then at its predicted position, so all matches
+are by chance. This is an absolute test, which a likelihood ratio between explanations cannot
+replace. Its level is that of the localization: the probability with which a wrong pose is accepted.
 """
 
 from __future__ import annotations
@@ -42,9 +41,11 @@ OFFSET_DIRECTIONS = 8
 def explain_images(case: Case, turns: RefinementResult | None, seed: int) -> Explanation:
     """Mistake that explains the images of stations on tripods whose edges may be chance matches.
 
-    Their localization was confirmed by chance, so the images are compared with the hypotheses as
-    those of stations that were not localized. turns : None without an estimate, for which there
-    were too few edges. seed : for the search.
+    The localization of such stations may be wrong, so their images are compared with the hypotheses
+    as those of stations that were not localized.
+
+    turns : None without an estimate, if there were too few edges.
+    seed : for the search.
     """
     session = case.session
     images = [p for p in case.images if not session.stations[p.station].handheld]
@@ -64,8 +65,8 @@ def explain_images(case: Case, turns: RefinementResult | None, seed: int) -> Exp
 
 
 class _Offered(NamedTuple):
-    """Numbers of edges of some stations: in sight, measured, and expected by chance; and the
-    p-value of the number that was measured.
+    """Numbers of edges of some stations: visible, measured, and expected by chance; and the p-value
+    of the number measured.
     """
 
     in_sight: int
@@ -94,12 +95,12 @@ def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
 
 
 def misplaced_stations(session: Session, turns: RefinementResult) -> dict[int, str]:
-    """Reasons why stations on a tripod may have a wrong pose, by their numbers: their edges may be
-    chance matches. Empty if that holds for all stations.
+    """Reasons why stations on a tripod may have a wrong pose, by station number: their edges may be
+    chance matches.
 
-    One search of a thousand is confirmed at a wrong pose, and little is lost with a station in
-    which the machine is hardly visible. Stations that observe a board on the base have their pose
-    from the board.
+    Empty if that applies to all stations. One search of a thousand is confirmed at a wrong pose,
+    and little is lost with a station in which the machine is hardly visible. Stations that observe
+    a board on the base have their pose from the board.
     """
     boards = set(turns.measurements.poses.station.tolist())
     reasons: dict[int, str] = {}
@@ -118,7 +119,11 @@ def misplaced_stations(session: Session, turns: RefinementResult) -> dict[int, s
 
 
 def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | None:
-    """Chance matches among the edges of some stations; None if these are significantly more."""
+    """Edges of some stations that may be chance matches.
+
+    None if at least a third of the visible edges were measured, or significantly more than by
+    chance.
+    """
     in_view = turns.observation
     mine = np.isin(in_view.edges.station, stations)
     measured = int(np.sum(mine & ~in_view.edges.coarse))
@@ -126,7 +131,7 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
         r.side >= 0 and r.code != "edges.out_of_sight" and r.station in stations
         for r in in_view.rejected
     )
-    # these are among both
+    # edges that the estimate rejected are counted twice, as measured and as rejected
     given_up = int(np.sum(mine & (turns.estimate.edge_weights < INLIER_WEIGHT)))
     in_sight = int(np.sum(mine)) + missed - given_up
     if not turns.images or measured >= FEW * in_sight:
@@ -140,11 +145,11 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
 
 
 def chance_of_count(own: int, counts: Array) -> float:
-    """Probability of so many edges or more by chance, from the counts (n,) in shifted images."""
+    """P-value of a number of edges under chance matches, from the counts (n,) in shifted images."""
     from scipy.special import stdtr
 
     mean = float(counts.mean())
-    # the scatter of eight counts may be smaller by chance than that of Poisson's distribution
+    # at least the scatter of a Poisson distribution: that of eight counts may be smaller by chance
     spread = max(float(counts.std(ddof=1)), np.sqrt(mean), 1.0)
     apart = (own - mean) / (spread * np.sqrt(1 + 1 / len(counts)))
     return float(stdtr(len(counts) - 1, -apart))

@@ -1,10 +1,10 @@
 """Components of the model discrepancy of a session, and their findings.
 
 Errors of the readings over the workspace (legs that yield under load, commanded axes that droop),
-with the motors' last steps (backlash, lag), with time (warming); a base that moves with the
-platform; stations that creep; legs that are no straight cylinders; a bed that is not flat. Heights
-determine only the last: other errors over the workspace lift the tool as an uneven bed does. Each
-is one entry of :func:`discrepancy_components`; their scales are estimated in
+with the motors' last steps (backlash, lag), and with time (warming); motions of the base with the
+platform; creep of stations; legs that are no straight cylinders; an uneven bed. From heights only
+the last can be determined, because other errors over the workspace have the same effect. Each is
+one entry of :func:`discrepancy_components`; their scales are estimated in
 :mod:`pkmcal.identify.discrepancy`.
 """
 
@@ -36,20 +36,20 @@ from pkmcal.outcome.finding import Finding, doubtful
 class DiscrepancyBasisOptions:
     """Constants of the smooth functions that may be added to the model."""
 
-    # distances over which errors of neighbouring poses are alike, in the root mean square distance
-    # of the session's poses from their middle; the last one leaves functions that are nearly
-    # straight
+    # correlation lengths of errors over the workspace, relative to the root mean square distance of
+    # the session's poses from their mean; functions with the last one are nearly linear
     lengths: tuple[float, ...] = (1.0, 1.5, 2.5, 4.0, 7.0)
-    # smooth functions of the pose: in six dimensions straight and square ones are 27
+    # largest number of functions of the pose: in six dimensions there are 27 linear and quadratic
+    # ones
     most_functions: int = 40
-    # factor from one correlation length of the bed to the next, from the points' mean distance,
-    # below which unevenness is noise, to the longest one, from which on it is nearly a parabola
+    # ratio of successive correlation lengths of a bed, from the points' mean distance, below which
+    # unevenness is noise, to the longest one
     length_step: float = 1.5
-    # the longest one, in the root mean square distance of the points from their middle. Over longer
-    # lengths a surface is what the machine's own parameters bend as well, and the data do not
-    # determine its size: a kit whose towers lean was refused for it
+    # longest correlation length of a bed, relative to the root mean square distance of the points
+    # from their mean. Parameters of the machine can reproduce surfaces with longer lengths, so that
+    # the data do not determine their scale: a kit with leaning towers was refused for it
     longest_bed_length: float = 1.0
-    # poses, evenly of all, by which the functions are made where there are more
+    # largest number of poses (Nyström landmarks) from which the functions are computed
     landmarks: int = 200
     # points along the visible part of an edge at which a change of the pose is evaluated
     points_along_edge: int = 9
@@ -60,11 +60,14 @@ DISCREPANCY_BASIS = DiscrepancyBasisOptions()
 
 @dataclass(frozen=True)
 class BedSurface:
-    """The unevenness of a bed at the points that were probed, all (n,): configuration, x and y of
-    the tool (m, base frame), height (m, up) with the mean taken off, and its standard deviation.
+    """Unevenness of a bed at the n probed points.
 
-    Where the machine's own parameters bend the bed as well, the height is what the surface's
-    smoothness makes of the rest, and the standard deviation says how little that is.
+    configuration : (n,).
+    x, y : (n,) of the tool, m, base frame.
+    height, sigma : (n,) m, upwards, with the mean subtracted, and its standard deviation.
+
+    Parts of the surface that the machine's parameters can reproduce as well are determined by the
+    prior of the surface only; the standard deviation contains their uncertainty.
     """
 
     configuration: Integers
@@ -76,14 +79,17 @@ class BedSurface:
 
 @dataclass(frozen=True)
 class ModelError:
-    """A component of the discrepancy that the data show.
+    """A detected component of the discrepancy.
 
-    code : such as readings.workspace. scale : its standard deviation, m or rad of what it acts on.
-    unit : m or rad. ratio : twice the logarithm of the likelihood ratio. tool, tool_before : m,
-    standard deviation of the platform's position, root mean square over the session's poses, with
-    all components and without any. sure : whether it is named, or only contained in the covariance,
-    for larger noise of the readings or poses explains the data as well. length : correlation
-    length, m, and surface : the map, of a bed; None of all else.
+    code : such as readings.workspace.
+    scale : its standard deviation, m or rad of the affected quantity.
+    unit : m or rad.
+    ratio : twice the log likelihood ratio.
+    tool, tool_before : m, standard deviation of the platform's position, root mean square over the
+        session's poses, with all components and without any.
+    sure : whether it is reported; otherwise the covariance contains it, but larger noise of
+        readings or poses explains the data as well.
+    length, surface : correlation length, m, and map, of an uneven bed; None otherwise.
     """
 
     code: str
@@ -97,7 +103,7 @@ class ModelError:
     surface: BedSurface | None = None
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Entry of calibration.json."""
         return {
             "code": self.code,
             "scale": self.scale,
@@ -115,8 +121,8 @@ UNEVEN_BED = "bed.surface"
 
 
 def discrepancy_findings(errors: tuple[ModelError, ...]) -> Iterator[Finding]:
-    """A warning for each component, the bed first, then the largest by evidence; none without sure
-    ones.
+    """Warnings about the components, the bed first, then by evidence; none unless they are
+    ``sure``.
     """
     if not any(one.sure for one in errors):
         return
@@ -132,7 +138,7 @@ def discrepancy_findings(errors: tuple[ModelError, ...]) -> Iterator[Finding]:
 
 
 def explains_heights(errors: tuple[ModelError, ...]) -> bool:
-    """Whether an uneven bed surely explains why heights scatter."""
+    """Whether a significantly uneven bed explains the scatter of heights."""
     return any(one.code == UNEVEN_BED and one.sure for one in errors)
 
 
@@ -157,7 +163,7 @@ def discrepancy_components(measurements: Measurements, estimate: Estimate) -> li
 
 
 def _of_bed(measurements: Measurements, estimate: Estimate) -> list[Component]:
-    """A bed that is not flat, where heights were felt: a Gaussian process over x and y."""
+    """Uneven bed, where heights were measured: a Gaussian process over x and y."""
     poses = measurements.poses
     felt = height_rows(measurements)
     if not felt.size:
@@ -165,7 +171,7 @@ def _of_bed(measurements: Measurements, estimate: Estimate) -> list[Component]:
     xy = estimate.state.T_base_platform[poses.configuration[felt], :2, 3]
     xy = xy - xy.mean(axis=0)
     size = float(np.sqrt(np.mean(np.sum(xy**2, axis=1))))
-    # n points all over a disc of that size are about so far from their neighbours
+    # mean distance of neighbours among n points spread over a disc of that size
     places = len(np.unique(xy.round(6), axis=0))
     apart = np.sqrt(2 * np.pi / places)
     count = int(
@@ -180,13 +186,15 @@ def _of_bed(measurements: Measurements, estimate: Estimate) -> list[Component]:
         return []
     effect = np.zeros((len(poses), 6, basis.shape[1]))
     effect[felt, 5] = basis
-    either = READING_ROWS, POSE_ROWS  # a height is as much its readings' as its probe's
+    either = READING_ROWS, POSE_ROWS  # enlarged noise of readings or probe may be unevenness
     in_metres = tuple((size * lengths).tolist())
     return [Component(Column(UNEVEN_BED, poses=effect), roots, either, in_metres)]
 
 
 def height_rows(measurements: Measurements) -> Integers:
-    """Rows of the measured poses that are heights: of their six numbers only z was measured."""
+    """Rows (n,) of the measured poses that are heights: only z of their six numbers was
+    measured.
+    """
     valid = np.any(measurements.poses.whiten != 0, axis=-2)
     return np.flatnonzero(valid[:, 5] & ~valid[:, :5].any(axis=1))
 
@@ -234,13 +242,16 @@ def smooth_functions(
     lengths: Sequence[float] = DISCREPANCY_BASIS.lengths,
     most: int = DISCREPANCY_BASIS.most_functions,
 ) -> tuple[Array, tuple[Array, ...]]:
-    """Functions (K, p) of places (K, d) with a mean of zero and orthonormal over the places, and
-    for each correlation length the root (p, p) of their coefficients' covariance, of functions
-    with a mean square of one.
+    """Principal functions of a Gaussian process at K points, by Nyström's method.
 
-    lengths : correlation lengths, the shortest first, in the root mean square distance of the
-    places from their middle. most : functions at most. Principal functions of a squared exponential
-    kernel of the shortest length, Nyström's way.
+    points : (K, d).
+    lengths : correlation lengths of the squared exponential kernel, the shortest first, relative to
+        the root mean square distance of the points from their mean.
+    most : largest number of functions.
+
+    Returns the functions (K, p), of the shortest length, with mean zero and orthogonal over the
+    points with a mean square of one; and for each correlation length the root (p, p) of the
+    covariance of their coefficients, normalized to a mean square of one.
     """
     size = float(np.sqrt(np.mean(np.sum(points**2, axis=1))))
     points = points / (size or 1.0)
@@ -276,8 +287,9 @@ def smooth_functions(
 
 
 def functions_of_time(n: int) -> Array:
-    """A straight and a square function (n, 2) of the number of a configuration, with means of zero
-    and, together, a mean square of one.
+    """Linear and quadratic function (n, 2) of the number of a configuration.
+
+    Their means are zero, and their mean square is, together, one.
     """
     time = np.linspace(-1, 1, n)
     both = np.stack([time, time**2 - np.mean(time**2)], axis=1)
@@ -286,7 +298,7 @@ def functions_of_time(n: int) -> Array:
 
 
 def _of_stations(measurements: Measurements, estimate: Estimate) -> Iterator[Component]:
-    """Motions between base and stations, turns in parts of the machine's size."""
+    """Motions of the stations relative to the base; rotations in units of the machine's size."""
     used, state, n = estimate.configurations, estimate.state, len(measurements.joints)
     stations = range(measurements.n_stations)
     points = points_of_poses(estimate.machine, state.T_base_platform[used])
@@ -319,7 +331,7 @@ def _motion_in_station(T: Array) -> Array:
 
 
 def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Component]:
-    """Legs that are thicker at one end, or bent: radius and axis (m) by three numbers a leg."""
+    """Tapered or bent legs: three numbers for each leg that change radius and axis, m."""
     if not len(measurements.edges):
         return
     edges, machine, state = measurements.edges, estimate.machine, estimate.state
@@ -351,7 +363,7 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
 
 
 def with_discrepancy(estimate: Estimate, discrepancy: Discrepancy) -> Estimate:
-    """The estimate whose covariances contain the discrepancy."""
+    """Estimate whose covariances contain the discrepancy."""
     if not discrepancy.scales:
         return estimate
     problem = estimate.problem.problem
@@ -365,7 +377,7 @@ def with_discrepancy(estimate: Estimate, discrepancy: Discrepancy) -> Estimate:
     return replace(
         estimate,
         joint_covariance=joint,
-        # what is left out may make a value less sure than the nominal model alone has it
+        # with the discrepancy a variance may exceed the prior variance
         data_share=np.maximum(data_share(machine, estimate.state.theta, joint[:n, :n], gauge), 0.0),
         column_covariance=covariance,
     )
@@ -374,7 +386,7 @@ def with_discrepancy(estimate: Estimate, discrepancy: Discrepancy) -> Estimate:
 def bed_surface(
     measurements: Measurements, estimate: Estimate, discrepancy: Discrepancy
 ) -> BedSurface:
-    """The bed's map, by the discrepancy's coefficients given the data."""
+    """Map of the bed, from the posterior of the discrepancy's coefficients."""
     felt, poses = height_rows(measurements), measurements.poses
     heights = [
         np.zeros((len(felt), column.count)) if column.poses is None else column.poses[felt, 5]
@@ -399,10 +411,11 @@ def model_errors(
     unit: str,
     surface: BedSurface | None,
 ) -> tuple[ModelError, ...]:
-    """The components found, with what they make of the tool's standard deviation.
+    """Detected components, with their effect on the tool's standard deviation.
 
-    tool, before : with the discrepancy and without. unit : of the readings. surface : of the bed,
-    where it is among them.
+    tool, before : with the discrepancy and without.
+    unit : of the readings.
+    surface : map of the bed, if it is one of the components.
     """
     with_, without = (float(np.sqrt(np.nanmean(x.position**2))) for x in (tool, before))
     return tuple(

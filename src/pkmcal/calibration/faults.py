@@ -7,6 +7,7 @@ Hypotheses about poses that disagree with the machine are in
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, VERDICT, RicherModel
+from pkmcal.levels import NOISE_EXCESS
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
@@ -33,30 +35,31 @@ from pkmcal.outcome.hypotheses import (
     posterior,
 )
 from pkmcal.session.load import Session
+from pkmcal.session.readings import rounding_step
 from pkmcal.wording import listed
 
 UNTOLD_BOARD_SIZE_SIGMA = 0.7
-"""Share of the prior sigma of a board's size from which its sigma is due to the file rather than to
-the data."""
+"""Ratio of the posterior to the prior sigma of a board's size above which the size is determined by
+the file rather than by the data."""
 BOARD_SIZE_DISAGREEMENT = 2.0
 """Standard deviations between a board's size by its file and by all other data from which a note
 reports both: by chance one session of twenty."""
 WRONG_SCALE_DEVIATIONS = 3.0
 """Standard deviations from the nominal scale of a reading from which a note reports it."""
 WRONG_MODEL_READING_SCALE = 100.0
-"""Factor on the readings' stated noise from which the scatter is a model error: mounted encoders
-are ten or thirty times as noisy as their data sheets."""
+"""Factor on the readings' stated noise above which the scatter is a model error: mounted encoders
+are ten or thirty times as noisy as in their data sheets."""
 FEWEST_POSES = 4
-"""Whole poses of one station from which the platform's rotation is tested."""
+"""Smallest number of whole poses of one station for a test of the platform's rotation."""
 
 
 def wrong_scale(estimate: Estimate) -> float:
-    """Common factor of all estimated lengths to the nominal lengths; 1 if no common factor explains
-    their difference. A board whose squares are larger than stated makes the whole machine larger.
+    """Ratio of all estimated lengths to the nominal lengths; 1 if no common ratio explains their
+    difference.
 
-    The factor is a hypothesis about differences in prior sigmas whose true size is unknown, so that
-    a poor nominal model has none, and has to explain most of their squares: a factor of one kind of
-    part makes a part of them only.
+    A board whose squares are larger than stated makes the whole machine larger. The hypothesis of a
+    common ratio has to explain most of the squared differences, in prior sigmas: with a poor
+    nominal model, or a ratio of one kind of part only, it does not.
     """
     machine = estimate.machine
     table = machine.parameters
@@ -83,8 +86,9 @@ def wrong_scale(estimate: Estimate) -> float:
 
 
 def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
-    """Estimate with the readings' noise as stated, for the comparison of hypotheses: otherwise the
-    noise scale would absorb a wrong sign, or an insufficient model.
+    """Estimate with the readings' noise as stated, for the comparison of hypotheses.
+
+    Otherwise the noise scale would absorb a wrong sign, or an insufficient model.
     """
     if estimate.statistics.reading_scale <= 1 or not len(measurements.poses):
         return estimate
@@ -92,32 +96,49 @@ def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Es
 
 
 def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """Reason against a result whose readings scatter by more than the nominal model's prior sigma,
-    so that they determine nothing, or by too much more than stated to be noise.
+    """Refusal if the noise of the readings exceeds the prior sigmas, so that they determine
+    nothing, or exceeds the stated noise so much that it is a model error.
     """
     s, tolerance = estimate.statistics, session.machine.document.tolerance
     units, noise = set(session.machine.joint_units), session.joint_noise * s.reading_scale
     most = min({"m": tolerance.offset, "rad": tolerance.angle}[unit] for unit in units)
     if s.reading_scale <= 1:
         return
+    facts: dict[str, Any] = {
+        "noise": noise,
+        "units": sorted(units),
+        **_rounding(session, noise),
+    }
     if noise > most:
-        yield wrong("readings.noise_beyond_tolerance", noise=noise, limit=most, units=sorted(units))
+        yield wrong("readings.noise_beyond_tolerance", limit=most, **facts)
     elif s.reading_scale >= WRONG_MODEL_READING_SCALE:
-        yield wrong(
-            "readings.noise_beyond_encoders",
-            noise=noise,
-            scale=s.reading_scale,
-            units=sorted(units),
-        )
+        yield wrong("readings.noise_beyond_encoders", scale=s.reading_scale, **facts)
+
+
+def _rounding(session: Session, noise: float) -> dict[str, Any]:
+    """Facts on the step of which all readings are whole multiples, where its rounding scatters more
+    than session.yaml states; none otherwise.
+
+    noise : by which the readings scatter, m or rad.
+    """
+    units = set(session.machine.joint_units)
+    least = np.sqrt(12) * session.joint_noise
+    step = rounding_step(session.joints, min(units), least) if len(units) == 1 else None
+    if step is None:
+        return {}
+    rounding = float(step / np.sqrt(12))
+    if noise > NOISE_EXCESS * rounding:  # more than rounding explains
+        return {"round_command": step}
+    return {"rounded_to": step, "rounding": rounding}
 
 
 def richer_model(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[RicherModel | None, tuple[Finding, ...]]:
-    """Richer model of the mechanism file that explains poses for which this model is insufficient,
-    None without such a model; and notes on models without an estimate.
+    """Richer model of the mechanism file that explains poses for which this model is insufficient.
 
-    Each additional parameter costs half a log n (:func:`parameter_cost`).
+    None without such a model; and notes on models without an estimate. Each additional parameter
+    costs half a log n (:func:`parameter_cost`).
     """
     null, machine = estimate.statistics.pose_scale, session.machine
     if null < POOR_MODEL_POSE_SCALE:
@@ -152,8 +173,9 @@ def richer_model(
 
 
 def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """Reason against a result whose lengths all have a common factor. Heights alone leave sizes to
-    the nominal model, whatever an uneven bed makes of them.
+    """Refusal if all estimated lengths have a common ratio to the nominal ones.
+
+    Not for heights alone, which do not determine sizes.
     """
     if only_heights(estimate):
         return
@@ -168,23 +190,25 @@ def noise_notes(
 ) -> Iterator[Finding]:
     """Warnings where the data contradict the noise that session.yaml states.
 
-    detections : whether a model violation makes readings scatter. explained : whether heights
-    scatter because the bed is uneven.
+    detections : whether a model violation explains the scatter of readings.
+    explained : whether an uneven bed explains the scatter of heights.
     """
     if explained:
         return
     s, units = estimate.statistics, sorted(set(session.machine.joint_units))
     if s.reading_scale != 1 and not _within(1.0, s.reading_range):
         least, most = s.reading_range
+        noise = session.joint_noise * s.reading_scale
         yield doubtful(
             "readings.noise",
             "session.yaml, joints.noise",
-            noise=session.joint_noise * s.reading_scale,
+            noise=noise,
             stated=session.joint_noise,
             bound=session.joint_noise * most if most is not None and not least else None,
             range=s.reading_range,
             units=units,
             explained="yes" if detections else "no",
+            **(_rounding(session, noise) if s.reading_scale > 1 else {}),
         )
     only_trackers = session.trackers and not any("board" in x.observe for x in session.stations)
     if only_trackers and s.pose_range[1] is not None and s.pose_range[1] < 1:
@@ -221,7 +245,7 @@ def size_notes(
         if sigma <= UNTOLD_BOARD_SIZE_SIGMA * tolerance:
             yield note("board.size_estimate", file, value=value, sigma=sigma)
             continue
-        # without the prior, which is the file's, the estimate is that of all other data
+        # the prior, which is the file's, is removed: 1 / other is the factor on the estimate
         other = max(1 - (sigma / tolerance) ** 2, np.finfo(float).eps)
         facts = {"tolerance": 100 * tolerance}
         if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT * tolerance:

@@ -69,12 +69,12 @@ CAMERA_TURNED_REASON = "all images together turn its camera by more than ten deg
 
 @dataclass(frozen=True)
 class HandheldOptions:
-    """Constants of the localization of images by hand."""
+    """Constants of the localization of hand-held images."""
 
     # largest probability that any image of a session is accepted with a wrong pose (statistical)
     misplaced: float = 0.05
-    # an image's best poses that are always scored again with a better known machine, whatever their
-    # score by the image alone: a wrong pose corrupts the estimate
+    # number of an image's best poses that are always scored again when the machine is known better,
+    # whatever their score by the image alone, because a wrong pose corrupts the estimate
     scored_again: int = 4
     # largest number of images that are scored with the nominal model, which takes twice as long as
     # with a machine from images
@@ -325,7 +325,7 @@ class _LocalizationState(NamedTuple):
     placed : images with accepted poses.
     landmarks : background points of these images.
     bare : images in which too few legs can be measured at their assumed pose.
-    failure : why the images accepted last could not be estimated together with the others.
+    failure : why the last accepted images could not be estimated together with the others.
     """
 
     scene: PriorScene
@@ -340,7 +340,7 @@ class _CachedHypotheses:
     """Hypotheses of one image, cached with the state in which they were scored.
 
     hypotheses : by localization from the image alone.
-    places : weighted by everything known.
+    places : weighted by all evidence.
     scores : by the joint estimate, None before it.
     by : marginal prior of the machine at that time, None for the nominal model.
     beside : number of images that determined the machine.

@@ -1,7 +1,7 @@
 """Selection of holdout configurations, and the estimate without them.
 
-They are spread over the workspace, or fill a region of it. The predictions of the calibrated
-machine for them are judged in :mod:`pkmcal.judge.holdouts`.
+Holdout configurations are spread over the workspace, or fill a region of it. The predictions of the
+calibrated machine for them are judged in :mod:`pkmcal.judge.holdouts`.
 """
 
 from __future__ import annotations

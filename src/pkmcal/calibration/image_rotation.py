@@ -1,11 +1,11 @@
-"""The hypothesis that images are upside down against their camera's file, by the score test.
+"""Hypothesis that images are upside down relative to their camera's file, by a score test.
 
-Images turned by half show the machine as well as before, from a station that is turned, too. But
-the principal point is then on the other side of the image's middle, which no pose of the camera
-makes up for. So the change from a camera to the same one turned by half is a column of one number
-(:mod:`pkmcal.identify.score`), whose estimate is 0 where the file is right and 1 where the images
-are upside down. At log-odds of ``act`` the images are measured by the turned camera (a repair); at
-``report`` the verdict has a warning. Cameras that are estimated with the machine are not tested.
+The machine in images rotated by half a turn is localized as well as before, with a rotated station.
+But the principal point is then on the other side of the image's middle, which no pose of the camera
+compensates. So the change from a camera to the same one rotated by half a turn is a column of one
+number (:mod:`pkmcal.identify.score`), whose estimate is 0 if the file is right and 1 if the images
+are upside down. At log-odds of ``act`` the images are measured with the rotated camera (a repair);
+at ``report`` the verdict has a warning. Cameras that are estimated with the machine are not tested.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from pkmcal.outcome.hypotheses import OPTIONS, Hypothesis, Ranked, decide
 from pkmcal.session.load import Session
 
 FURTHER_THAN_TURNED = 1.5
-"""Multiple of the change beyond which the estimate is neither camera, though one is nearer."""
+"""Estimate of the change above which neither the camera nor the rotated one is right."""
 USUAL_CENTRE_ERROR = 1.5
-"""Prior sigma (px) of a calibrated camera's principal point along the change, where its file states
+"""Prior sigma (px) of a calibrated camera's principal point along the change, if its file states
 none."""
 LEAST_CENTRE_ERROR = 1e-6
 """Prior sigma (px) of a principal point that a file states to be exact."""
@@ -40,9 +40,9 @@ LEAST_CENTRE_ERROR = 1e-6
 
 @dataclass(frozen=True)
 class UpsideDown(Hypothesis[Session]):
-    """Images that are upside down against their camera's file, the subject.
+    """Images that are upside down relative to their camera's file, the subject.
 
-    camera : turned by half, as the images are. Facts: ``stations``, names in session.yaml.
+    camera : rotated by half a turn, as the images are. Facts: ``stations``, names in session.yaml.
     """
 
     camera: Camera = field(kw_only=True)
@@ -79,8 +79,10 @@ def rotation_finding(one: Ranked[UpsideDown]) -> Finding:
 
 
 def upside_down(session: Session, turns: RefinementResult) -> tuple[Ranked[UpsideDown], ...]:
-    """Cameras whose images are upside down against their files with log-odds of ``report`` or more,
-    and of no station upright with as much.
+    """Cameras whose images are upside down relative to their files with log-odds of ``report`` or
+    more.
+
+    Cameras with a station whose images are upright with the same log-odds are excluded.
     """
     changed = CameraChange.of(session, turns.observation, turns.measurements)
     refined = turns.measurements.intrinsics_factor.shape[-1] > 0
@@ -115,8 +117,8 @@ def _half_turn_change(camera: Camera) -> Array:
 
 
 def _file_sigma(camera: Camera) -> float:
-    """Prior sigma of the position along the change, 0 to 1, by the file's covariance of the
-    principal point; infinite where it is in the middle.
+    """Prior sigma of the number of the column, by the file's covariance of the principal point;
+    infinite if the principal point is in the image's middle.
     """
     centre = _half_turn_change(camera)[CENTER]
     length = float(np.linalg.norm(centre))
@@ -129,9 +131,9 @@ def _file_sigma(camera: Camera) -> float:
 
 
 def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
-    """Log-odds of 1 against 0 by estimates (n,) of some stations with standard deviations (n,).
+    """Log-odds of 1 against 0 by the estimates (n,) of some stations with standard deviations (n,).
 
-    0 where the estimates determine nothing, or neither camera fits.
+    0 if the estimates determine nothing, or if neither camera fits.
     """
     weight = sigma**-2.0
     if not weight.any():
@@ -142,7 +144,7 @@ def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
 
 
 def turned_round(session: Session, cameras: Mapping[str, Camera]) -> Session:
-    """The session with other cameras in place of those of some files."""
+    """Session with other cameras in place of those of some files."""
     stations = tuple(
         replace(station, camera=cameras.get(station.camera_file, station.camera))
         for station in session.stations

@@ -48,7 +48,7 @@ def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
         return ()
     readings = joints[evenly(len(joints), NUMBERING_CONFIGURATIONS)]
     level = EvidenceLevel("nominal model", partial(_expected_ratios, machine, readings))
-    # of two motors another first leg is an exchange
+    # with two motors, counting from the other one exchanges them
     ranked = posterior(renumbered_legs(m) or exchanged_motors(m), [level])
     orders = [one.hypothesis.facts["order"] for one in ranked if one.log_odds > -OPTIONS.act]
     return tuple(sorted(orders, key=lambda order: order[0]))
@@ -57,9 +57,10 @@ def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
 def _expected_ratios(
     machine: Machine, readings: Array, hypotheses: Sequence[ReadingHypothesis]
 ) -> Array:
-    """Log-likelihood ratios (N,) of other numberings that measurements are expected to have at
-    readings (n, m) where the stated one is right: by the differences of the nominal model from
-    itself with the legs in another order, after the best rigid motion, in prior sigmas.
+    """Expected log-likelihood ratios (N,) of other numberings if the stated one is right.
+
+    By the differences of the nominal model from itself with the legs in another order, after the
+    best rigid motion, in prior sigmas, at readings (n, m).
     """
     layout, table = machine.layout, machine.parameters
     column, sigma = layout.actuated, table.tolerance

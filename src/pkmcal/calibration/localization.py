@@ -43,10 +43,11 @@ ALLOWED_LEG_MISS = 2.0
 
 @dataclass(frozen=True)
 class SearchImages:
-    """Numbers of images in which the machine is localized, spread over each station's."""
+    """Numbers of images in which the machine is localized, spread over those of each station."""
 
-    # most images of a station, and of all together: a search uses eight, and thirty that confirm
-    # it, each with a z-score of one, have five together. Their tables take 200 to 400 MB
+    # largest number of images of a station, and of all stations: a search uses eight, and thirty
+    # held-out images with a z-score of one each have a joint z-score above five. Their tables take
+    # 200 to 400 MB
     most_at_station: int = 64
     most: int = 128
     # images of each station, however many stations there are: as many as a search uses
@@ -110,14 +111,15 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     """Nominal poses T_base_platform (K, 4, 4) of all configurations.
 
     most : accept readings that the nominal model can take in most configurations; measured poses
-    may determine the others, for a motor's zero is nominal to degrees at best. Raises `InputError`
-    that names the configurations without a pose.
+        may determine the others, because the zero of a motor is often nominal to degrees only.
+
+    Raises `InputError` that names the configurations without a pose.
     """
     try:
         fk = session.forward
     except GeometryError as error:  # the nominal model is the user's: it is at fault
         raise error.as_input(session.document["mechanism"]) from None
-    # near the ends of its workspace a nominal model that is right to its tolerance may not close
+    # near the ends of its workspace a nominal model within its prior sigmas may not close
     near = fk.error < _allowed_leg_miss(session.machine, fk)
     if near.all() or (most and near.mean() > MAJORITY):
         _check_turns(session, fk.T_base_platform, near)
@@ -164,9 +166,11 @@ def _check_columns(session: Session, bad: list[str]) -> None:
 
 
 def _closing_misfit(session: Session, joints: Array) -> float:
-    """Root mean square by which legs miss the platform at readings (K, m), relative to
-    :func:`_allowed_leg_miss`, no configuration by more than ``VerdictOptions.too_noisy``; where the
-    platform turns further than its parts allow, by that.
+    """Root mean square closure error of the legs at readings (K, m), relative to
+    :func:`_allowed_leg_miss`.
+
+    Each configuration counts with ``VerdictOptions.too_noisy`` at most. If the platform rotates
+    further than its parts allow, the excess counts instead.
     """
     machine = session.machine
     fk = machine.forward_result(joints)
@@ -177,9 +181,10 @@ def _closing_misfit(session: Session, joints: Array) -> float:
 
 
 def _allowed_leg_miss(machine: Machine, fk: ForwardResult) -> Array:
-    """Largest closure error (K,), m, at readings of a machine that differs by its prior sigmas.
+    """Largest closure error (K,), m, at the readings of a machine that differs by its prior sigmas.
 
-    More rods than freedoms meet only in the true geometry: each misses by its own errors.
+    More rods than degrees of freedom meet only in the true geometry: each has a closure error of
+    its own.
     """
     table = machine.parameters
     if not machine.layout.overdetermined:
@@ -217,7 +222,8 @@ def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
 class LegLocalization:
     """Localization of all stations.
 
-    used : indices of the images that were used, by station; views : of these images.
+    used : indices of the images that were used, by station.
+    views : views of these images.
     """
 
     views: tuple[StationView, ...]
@@ -241,11 +247,12 @@ def localize_by_legs(
 ) -> LegLocalization:
     """Localize every station that observes legs; nothing is raised.
 
-    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``images``.
-    boards : on the base, give stations without a pose by hand a start, from those that were
-    localized. starts : (S, 4, 4) of all stations, where there are better starts than by hand; NaN
-    elsewhere. A station that is not recognised from its start is searched anywhere. For stations
-    with many images some are used, spread over all.
+    poses : T_base_platform (K, 4, 4) of the configurations.
+    rngs : one for each of ``images``.
+    boards : on the base; through them localized stations give others without a rough pose a start.
+    starts : (S, 4, 4) better starts than the rough poses, for all stations; NaN for none. A station
+        that is not localized from its start is searched anywhere.
+    numbers : numbers of images that are used, spread over those of each station.
     """
     boards = boards or Boards()
     machine = session.machine
@@ -263,17 +270,20 @@ def localize_by_legs(
         start_poses = [
             T if T is not None or np.isnan(start).any() else start for T, start in start_pairs
         ]
-    # one station after the other: what works its tables out uses all threads
+    # one station after the other, because the computation of its tables uses all threads
     views = tuple(view(p.select(some)) for p, some in zip(images, in_view, strict=True))
     solution = _searched(views, [start_poses[s] for s in at], [None] * len(at), rngs)
-    # Through the board a pose by hand would be off by its angle times the stations' distance, so
-    # the rest are searched from where the search has ended with those that were found.
+    # Other stations start from the localized ones through the boards. A rough pose instead would
+    # have an error of its angle times the distance between the stations.
     good: list[Array | None] = [None] * len(start_poses)
     for s, pose in zip(at, solution, strict=True):
         good[s] = pose.T_camera_base if pose and pose.good else None
+    # second search, of the stations that were not localized
     ahead = boards.joined(good)
     solution = _searched(views, [ahead[s] for s in at], solution, rngs)
-    return LegLocalization(views, tuple(_anywhere(views, solution, rngs)), in_view)
+    localized = _anywhere(views, solution, rngs)
+    localized = _again(views, [start_poses[s] for s in at], localized, rngs)
+    return LegLocalization(views, tuple(localized), in_view)
 
 
 Search = LocalizedPose | None
@@ -285,7 +295,7 @@ def _searched(
     before: Sequence[Search],
     rngs: list[np.random.Generator],
 ) -> list[Search]:
-    """Localizations so far, or else by a search from each start that is given."""
+    """Localizations so far or, where these are not good, by a search from each given start."""
 
     def search(
         view: StationView, start: Array | None, before: Search, rng: np.random.Generator
@@ -294,14 +304,16 @@ def _searched(
             return before
         return _better(find_station(view, start, rng), before)
 
-    # one after the other: arrays about a known pose are so small that threads wait for one another
+    # one after the other: around a known pose arrays are so small that threads only wait
     return list(map(search, views, starts, before, rngs))
 
 
 def _anywhere(
     views: tuple[StationView, ...], before: Sequence[Search], rngs: list[np.random.Generator]
 ) -> list[LocalizedPose]:
-    """Localizations that are sure, or else the better of the present one and a global search."""
+    """Localizations that are certain; for the others the better of the present one and a global
+    search.
+    """
 
     def search(view: StationView, before: Search, rng: np.random.Generator) -> LocalizedPose:
         if before and before.sure:
@@ -310,6 +322,30 @@ def _anywhere(
 
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(search, views, before, rngs))
+
+
+def _again(
+    views: tuple[StationView, ...],
+    starts: list[Array | None],
+    before: list[LocalizedPose],
+    rngs: list[np.random.Generator],
+) -> list[LocalizedPose]:
+    """Localizations, those of stations that were missed from a second draw of poses.
+
+    The search is random, and misses a pose in some of a hundred stations. A second attempt doubles
+    the probability of an acceptance by chance, so its p-value is multiplied by two.
+    """
+
+    def search(
+        view: StationView, start: Array | None, before: LocalizedPose, rng: np.random.Generator
+    ) -> LocalizedPose:
+        if before.good or len(view.configuration) < 2:
+            return before
+        second = find_station(view, start, rng, near_prior=True)
+        return _better(replace(second, p_value=min(2 * second.p_value, 1.0)), before)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(search, views, starts, before, rngs))
 
 
 def _better(one: LocalizedPose, other: Search) -> LocalizedPose:
@@ -324,9 +360,11 @@ def mistake_in(
     leg_localization: LegLocalization,
     rng: np.random.Generator,
 ) -> InputError | None:
-    """The error about stations that were not recognised, or whose images a hypothesis explains
-    better than the session as stated. A reading that never changes is named before all others, for
-    its effect may be like any of theirs.
+    """Error about stations that were not localized, or whose images a hypothesis explains better
+    than the session as stated.
+
+    A reading that never changes is reported first, because its effect may equal that of any
+    hypothesis.
     """
     still = frozen_in(session)
     if still is not None and not leg_localization.complete:  # an error in any case, and cheaper
@@ -338,7 +376,7 @@ def mistake_in(
 def suspect_stations(
     session: Session, images: list[StationImages], leg_localization: LegLocalization
 ) -> list[SuspectStation]:
-    """Stations as hypotheses about them need them, with the files of the images in use."""
+    """Stations as input of hypotheses, with the files of the images in use."""
     stations = [session.stations[p.station] for p in images]
     return [
         SuspectStation(
@@ -362,7 +400,7 @@ def suspect_stations(
 
 
 def frozen_in(session: Session) -> InputError | None:
-    """The error about readings that never change; None without such."""
+    """Error about readings that never change; None without such readings."""
     joints = session.document["joints"]
     return frozen(session.joints, session.joint_noise, joints["columns"], joints["file"])
 
@@ -370,9 +408,10 @@ def frozen_in(session: Session) -> InputError | None:
 class StationSearch(NamedTuple):
     """Poses of all stations.
 
-    recognition : in the images that were searched, None where none were. T_camera_base : (S, 4, 4),
-    NaN for hand-held images that are not placed yet. error : why another station has no pose, or
-    which mistake explains its images; poses are then incomplete.
+    recognition : localization by the legs, None if no images were searched.
+    T_camera_base : (S, 4, 4), NaN for hand-held images that are not localized yet.
+    error : why another station has no pose, or the mistake that explains its images; poses are then
+        incomplete.
     """
 
     leg_localization: LegLocalization | None
@@ -387,9 +426,10 @@ def localize_stations(
     rng: np.random.Generator,
     progress: Progress = no_progress,
 ) -> Array:
-    """Poses T_camera_base (S, 4, 4) of all stations, as of :func:`locate_stations`.
+    """Poses T_camera_base (S, 4, 4) of all stations, by :func:`locate_stations`.
 
-    Raises `InputError`, or `ResultError`, where nothing determines one that is not hand-held.
+    Raises `InputError`, or `ResultError`, if the pose of a station that is not hand-held is
+    undetermined.
     """
     value = locate_stations(session, images, boards, rng, progress)
     if value.error is not None:
@@ -404,11 +444,12 @@ def locate_stations(
     rng: np.random.Generator,
     progress: Progress = no_progress,
 ) -> StationSearch:
-    """Poses of all stations, each by the first source that determines it: the session and boards,
-    localization by the legs, measured poses. Nothing is raised.
+    """Poses of all stations, each by the first source that determines it; nothing is raised.
 
-    images : in which the machine is localized, none hand-held. progress : called with the step
-    in words and the share done.
+    Sources are the session and boards, localization by the legs, and measured poses.
+
+    images : in which the machine is localized, none hand-held.
+    progress : called with the step in words and the share done.
     """
     nowhere = np.full((len(session.station_names), 4, 4), np.nan)
     value: LegLocalization | None = None
@@ -421,6 +462,8 @@ def locate_stations(
         rngs = rng.spawn(len(images) + 1)
         count = sum(len(p.images) for p in images)
         progress(f"Localizing the stations by {count} images", 0.0)
+        # by the legs, unless a mistake explains the images better; others through boards on the
+        # base
         value = localize_by_legs(session, images, poses, rngs[1:], boards, start_poses)
         progress("Testing hypotheses about the images", 0.8)
         mixed_up = mistake_in(session, images, value, rngs[0])
@@ -433,6 +476,7 @@ def locate_stations(
         for k, T in enumerate(boards.joined(visible)):
             start_poses[k] = start_poses[k] if T is None else T
     by_hand = [s.handheld for s in session.stations] + [False] * len(session.trackers)
+    # stations without a pose so far: by measured poses
     if not (np.isnan(start_poses[:, 0, 0]) & ~np.array(by_hand, dtype=bool)).any():
         return StationSearch(value, start_poses, None)
     try:
@@ -442,8 +486,9 @@ def locate_stations(
 
 
 def prior_station_poses(session: Session, boards: Boards) -> Array:
-    """T_camera_base (S, 4, 4) of all stations without any leg: as the session states, or by a board
-    on the platform; NaN where there is neither.
+    """T_camera_base (S, 4, 4) of all stations without localization by the legs.
+
+    As the session states, or by a board; NaN where there is neither.
     """
     # the pose of a single image by hand is too rough for the images that a board joins to it
     given = [None if one.handheld else one.T_camera_base for one in session.stations]
@@ -452,8 +497,9 @@ def prior_station_poses(session: Session, boards: Boards) -> Array:
     T_camera_base = T_camera_base.reshape(-1, 4, 4)
     by_hand = np.array([station.handheld for station in session.stations], dtype=bool)
     lost = np.isnan(T_camera_base[: len(session.stations), 0, 0]) & ~by_hand
-    legs_tell = any(lost[k] and k not in boards.stations for k in legs_stations(session))
-    if boards.body == "base" or not boards.stations or legs_tell or not lost.any():
+    # If a station is localized by its legs only, the others are searched with it, from the boards.
+    by_legs_only = any(lost[k] and k not in boards.stations for k in legs_stations(session))
+    if boards.body == "base" or not boards.stations or by_legs_only or not lost.any():
         return T_camera_base
     return _by_poses(session, boards, T_camera_base)
 
@@ -492,9 +538,9 @@ def _tracker_starts(session: Session) -> list[Array | None]:
 def boards_of(session: Session, images: list[StationImages]) -> Boards:
     """The session's board in its images; see :func:`pkmcal.boards.stations.find_boards`.
 
-    Images that only show the board are decoded one by one, on access.
+    Images of the board alone are decoded one by one, on access.
     """
-    if session.board is None:  # as most, and what looks for boards takes a while to load
+    if session.board is None:  # the usual case; the detection of boards is slow to import
         return Boards()
     from pkmcal.boards.stations import find_boards
 
@@ -504,7 +550,7 @@ def boards_of(session: Session, images: list[StationImages]) -> Boards:
 def board_images(
     session: Session, station_images: list[StationImages]
 ) -> dict[int, Sequence[Integers]]:
-    """All stations' images by their number: decoded already, or when they are looked at."""
+    """Images of all stations by station number: decoded already, or on access."""
     images: dict[int, Sequence[Integers]] = {p.station: p.images for p in station_images}
     for number, station in enumerate(session.stations):
         if number not in images:

@@ -1,6 +1,6 @@
 """Model violations of a session: readings, cameras, boards, stations, tubes.
 
-Each violation is a column (:mod:`pkmcal.measurements.columns`) that is made beside its subject,
+Each violation is a column (:mod:`pkmcal.measurements.columns`) that is defined beside its subject,
 with its derivatives and the facts of its finding. Here all of them are score-tested at the
 false-alarm level of the session (:mod:`pkmcal.identify.score`).
 """
@@ -41,23 +41,26 @@ from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms import machine_from_document
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
 from pkmcal.mechanisms.closure import scales as scales_of
+from pkmcal.mechanisms.disturbances import compliance, tool_shift, weight_on_readings
 from pkmcal.mechanisms.joints import screw_turns
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
 from pkmcal.session.load import Session
 
 MOST_TOOL_SHIFT = 1.0
-"""Shift of the tool by a violation, in standard deviations, beyond which the result is refused."""
+"""Shift of the tool by a violation, in standard deviations, above which the result is refused."""
 
 
 @dataclass(frozen=True)
 class DetectedViolation:
-    """A model violation that the data show.
+    """A detected model violation.
 
-    finding : for the verdict, a reason where it shifts the tool by more than MOST_TOOL_SHIFT.
-    value, sigma : (k,) estimates of its numbers, all that were found free together. tool : by how
-    many of its standard deviations the platform's position moves if it is taken up, root mean
-    square over the session's poses. shift : the same in m. kind : word for calibration.json.
+    finding : for the verdict, a refusal if it shifts the tool by more than MOST_TOOL_SHIFT.
+    value, sigma : (k,) one-step estimates of its numbers, all detected violations together.
+    tool, shift : displacement of the platform's position if the violation becomes an unknown, root
+        mean square over the session's poses, in its standard deviations, and in m.
+    kind : word for calibration.json.
+    rivals : columns of violations that explain the data as well, the likeliest first.
     """
 
     finding: Finding
@@ -67,6 +70,7 @@ class DetectedViolation:
     tool: float
     shift: float
     kind: str
+    rivals: tuple[Column, ...] = ()
 
     @property
     def code(self) -> str:
@@ -96,15 +100,17 @@ class DetectedViolation:
             "chance": self.score.adjusted,
             "moves_tool": self.shift,
             "moves_tool_in_sigmas": self.tool,
+            "rivals": [{"code": one.code, "of": one.subject} for one in self.rivals],
         }
 
 
 class ModelViolations(NamedTuple):
     """Deviations of the data from the model.
 
-    violations : named violations, the smallest p-value first. errors : components of the model
-    discrepancy beside them. estimate : whose covariance contains the discrepancy. random : the
-    discrepancy's columns.
+    violations : named violations, the smallest p-value first.
+    errors : components of the model discrepancy.
+    estimate : estimate whose covariance contains the discrepancy.
+    random : columns of the discrepancy.
     """
 
     violations: tuple[DetectedViolation, ...]
@@ -121,9 +127,10 @@ def model_violations(
 ) -> ModelViolations:
     """Deviations of the data from the model, with and without names.
 
-    A violation is named only if it explains more than the discrepancy does: those that are detected
-    first are tested once more beside the discrepancy.
+    A violation is named only if it explains more than the discrepancy does: after the discrepancy
+    is estimated, violations are tested again with its components as random effects.
     """
+    # columns of all violations, by family; tubes have a score of their own
     ended = estimate.linearized
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     families = [list(family(session, observation, measurements, estimate)) for family in TESTED]
@@ -137,6 +144,7 @@ def model_violations(
     tube_scores = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
     in_view = np.flatnonzero(estimate.configurations)
 
+    # column of violation k: a listed one, or a single reading
     def declared(k: int) -> Column:
         if k < len(listed):
             return listed[k]
@@ -158,6 +166,7 @@ def model_violations(
         value = tests.significant([k for k, _ in tube_scores])
         return tests, [*value, *tube_scores]
 
+    # violations, then the discrepancy beside them, then the violations beside the discrepancy
     tests, value = tested(())
     discrepancy = discrepancy_of(
         *ended,
@@ -168,6 +177,7 @@ def model_violations(
     )
     if discrepancy.scales and value:
         tests, value = tested(discrepancy.random)
+    # covariance with the discrepancy, and its effect on the tool
     before = tool_of(session, estimate)
     estimate = with_discrepancy(estimate, discrepancy)
     tool = tool_of(session, estimate) if discrepancy.scales else before
@@ -177,11 +187,22 @@ def model_violations(
     errors = model_errors(discrepancy, tool, before, units[0], surface)
     if not value:
         return ModelViolations((), errors, estimate, discrepancy.random)
+    # one-step estimates of the named violations
     fits = tests.fitted([k for k, _ in value])
     last = len(fits) - len(tubes)
     fits[last:] = [_tube_update(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
+    numbers = [k for k, _ in value]
     violations = tuple(
-        _detection(declared(k), score, fit, tool)
+        _detection(
+            declared(k),
+            score,
+            fit,
+            tool,
+            # a tube's value is that of its own lines
+            []
+            if k in dict(tube_scores)
+            else [listed[n] for n in tests.rivals(k, [n for n in numbers if n != k])],
+        )
         for (k, score), fit in zip(value, fits, strict=True)
     )
     return ModelViolations(violations, errors, estimate, discrepancy.random)
@@ -209,27 +230,30 @@ def _tube_update(fit: OneStepUpdate, one: Outline) -> OneStepUpdate:
 
 
 def _detection(
-    one: Column, score: Score, fit: OneStepUpdate, tool: ToolAccuracy
+    one: Column, score: Score, fit: OneStepUpdate, tool: ToolAccuracy, rivals: Sequence[Column]
 ) -> DetectedViolation:
     shifted = np.linalg.norm((tool.by_parameters @ fit.by_data)[:, 3:], axis=-1)
     shift = float(np.sqrt(np.nanmean(shifted**2)))
     sigma = float(np.sqrt(np.nanmean(tool.position**2)))
-    ratio = shift / sigma if sigma > 0 else np.inf  # where nothing that is free moves the tool
+    ratio = shift / sigma if sigma > 0 else np.inf  # no free parameter moves the tool
     level = Level.WRONG if ratio > MOST_TOOL_SHIFT and not one.remark else Level.DOUBTFUL
-    # what the data do not determine is no number
+    # undetermined numbers are not reported
     facts = {
         name: None if isinstance(value, float) and not np.isfinite(value) else value
         for name, value in one.facts(fit.value, fit.sigma).items()
     }
     facts |= {"chance": score.adjusted, "tool_shift": shift, "tool_shift_sigmas": ratio}
+    facts["rivals"] = [f"{other.kind} ({other.subject})" for other in rivals]
     result = Finding(one.code, level, facts, one.subject)
-    return DetectedViolation(result, fit.value, fit.sigma, score, ratio, shift, one.kind)
+    return DetectedViolation(
+        result, fit.value, fit.sigma, score, ratio, shift, one.kind, tuple(rivals)
+    )
 
 
 def _reading_scales(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Readings of another scale."""
+    """Scales of the readings."""
     del observation
     layout, document = estimate.machine.layout, session.document["joints"]
     drawn = scales_of(layout, session.machine.parameters.nominal)
@@ -241,7 +265,7 @@ def _reading_scales(
 def _reading_plays(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Motors with play."""
+    """Play of the motors."""
     del observation, estimate
     names, units = session.document["joints"]["columns"], session.machine.joint_units
     yield from readings.play_columns(measured.joints, names, units)
@@ -250,7 +274,7 @@ def _reading_plays(
 def _eccentric_encoders(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Cranks whose encoders' discs are not centred."""
+    """Eccentricity of the encoder discs of cranks."""
     del observation, estimate
     names, units = session.document["joints"]["columns"], session.machine.joint_units
     yield from readings.eccentricity_columns(measured.joints, names, units)
@@ -259,7 +283,7 @@ def _eccentric_encoders(
 def _lenses(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Cameras that are not as their files say, by the violations that their models declare."""
+    """Cameras that differ from their files, by the violations that their models declare."""
     del estimate
     if measured.intrinsics_factor.shape[-1]:
         return  # they are estimated already
@@ -278,8 +302,9 @@ def _lenses(
 def _lenses_of_stations(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """A station whose camera is another than that of the other stations with the same file; not of
-    images by hand, whose focal lengths are estimated one by one.
+    """Station whose camera differs from that of the other stations with the same file.
+
+    Not for hand-held images, whose focal lengths are estimated one by one.
     """
     del estimate
     files = [station.camera_file for station in session.stations]
@@ -322,8 +347,9 @@ def _of_lens(facts: Mapping[str, Any], **where: str) -> Callable[[Array, Array],
 
 @dataclass(frozen=True)
 class CameraChange:
-    """Derivative of measurements by a change of cameras' parameters: edges (N, 2, n) and poses (M,
-    6, n), with the station of each, (N,) and (M,).
+    """Derivative of measurements by a change of cameras' parameters.
+
+    Edges (N, 2, n) and poses (M, 6, n), with the station of each, (N,) and (M,).
     """
 
     edges: Array
@@ -335,7 +361,7 @@ class CameraChange:
     def of(
         cls, session: Session, observation: Observation, measured: Measurements
     ) -> CameraChange | None:
-        """Nothing where there is no camera."""
+        """Derivative for a session's measurements; None without a camera."""
         cameras = [station.camera for station in session.stations]
         if not cameras:
             return None
@@ -346,8 +372,9 @@ class CameraChange:
         return cls(edges, poses, measured.edges.station, measured.poses.station)
 
     def of_stations(self, column: Column, stations: Booleans, change: Array) -> Column:
-        """A column with the derivatives by k numbers of some stations' camera, (S,): ``change``
-        (n, k) of its parameters.
+        """Column with the derivatives by k numbers of the camera of some stations, (S,).
+
+        change : (n, k) derivative of the camera's parameters.
         """
         n = len(change)
         edges = np.flatnonzero(stations[self.edge_station])
@@ -365,7 +392,7 @@ class CameraChange:
 def _boards(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Boards of another size."""
+    """Sizes of the boards."""
     del observation, estimate
     for m, mount in enumerate(measured.mounts):
         if mount.name == "board":
@@ -377,7 +404,7 @@ def _boards(
 def _tripods(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Stations that did not stand still."""
+    """Stations that moved during the session."""
     del observation, estimate
     for s, name in enumerate(session.station_names):
         in_view = [x.configuration[x.station == s] for x in (measured.edges, measured.poses)]
@@ -389,7 +416,7 @@ def _tripods(
 def _leaning_towers(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Sliders that stand in other directions than the mechanism file fixes, by two angles each."""
+    """Directions of sliders that the mechanism file fixes, two angles each."""
     del session, observation
     machine, used = estimate.machine, estimate.configurations
     table, layout, document = machine.parameters, machine.layout, machine.document
@@ -397,7 +424,7 @@ def _leaning_towers(
     sliders = [leg for leg, one in enumerate(document.legs) if one.base.joint == "slider"]
     if not fixed or not sliders:
         return
-    # a slider that leans by x moves its limb's end as another reading does:
+    # a lean x of a slider has the same effect on the closure as a change of its reading:
     # dc/dreading * dreading = dc/daxis * x
     opened = machine_from_document(document.model_copy(update={"fixed": ()})).parameters
     directions = opened.free_matrix()
@@ -420,7 +447,7 @@ def _leaning_towers(
 def _screw_leads(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Screws that joints turn, of another lead than the mechanism file's, or another thread."""
+    """Leads and hands of screws that are turned by joints."""
     del session, observation
     machine, used = estimate.machine, estimate.configurations
     layout, screws = machine.layout, machine.layout.screws
@@ -440,10 +467,39 @@ def _screw_leads(
     yield Column("machine.screw_lead", "screws", "screw lead", readings=by, facts=facts)
 
 
+def _sag(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Drives that yield under a load, of a stiffness that the mechanism file does not state; one
+    compliance for all of them.
+    """
+    del session, observation
+    machine, used = estimate.machine, estimate.configurations
+    load = machine.document.load
+    if load is None or compliance(machine) is not None or len(set(machine.joint_units)) > 1:
+        return
+    poses = estimate.state.T_base_platform[used]
+    by = np.zeros((*measured.joints.shape, 1))
+    by[used, :, 0] = weight_on_readings(machine, poses)
+    shift = tool_shift(machine, poses, by[used, :, 0])
+    size = float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1))))
+
+    def facts(value: Array, sigma: Array) -> dict[str, Any]:
+        return {
+            "value": value[0],
+            "sigma": sigma[0],
+            "mass": load.mass,
+            "sinks": size * value[0],
+            "stiffness": 1 / value[0] if value[0] > 0 else None,
+        }
+
+    yield Column("machine.sag", "drives", "sag under the load", readings=by, facts=facts)
+
+
 def _joint_offsets(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Universal joints whose two axes do not meet, by the axes' distance e.
+    """Universal joints whose two axes do not meet as stated, by the axes' distance e.
 
     The second axis then lies e towards the other end, square to the first axis v. With the angle
     beta of the leg out of the plane square to v, the leg's length is |B - A| - e cos(beta), to
@@ -465,13 +521,18 @@ def _joint_offsets(
             axis = getattr(node, "axis", None)
             if node.joint != "universal" or axis is None or not layout.rod_reads[j]:
                 continue
+            # cos(beta) is the sine of the angle between leg and first axis
             v = to_base @ (np.array(axis) / np.linalg.norm(axis))
             across = np.sqrt(1 - np.sum(u[:, j] * v, axis=-1) ** 2)
             by = np.zeros((*measured.joints.shape, 1))
             by[used, layout.actuated[j], 0] = across / scale[j]
 
-            def facts(value: Array, sigma: Array, side: str = side) -> dict[str, Any]:
-                return {"value": value[0], "sigma": sigma[0], "side": side}
+            stated = getattr(node, "offset", None) or 0.0
+
+            def facts(
+                value: Array, sigma: Array, side: str = side, stated: float = stated
+            ) -> dict[str, Any]:
+                return {"value": stated + value[0], "sigma": sigma[0], "side": side}
 
             yield Column(
                 "machine.joint_offset",
@@ -491,6 +552,6 @@ def _of_lean(value: Array, sigma: Array) -> dict[str, Any]:
 
 TESTED = (
     _reading_scales, _reading_plays, _eccentric_encoders, _leaning_towers, _screw_leads,
-    _joint_offsets, _lenses, _lenses_of_stations, _boards, _tripods,
+    _joint_offsets, _sag, _lenses, _lenses_of_stations, _boards, _tripods,
 )  # fmt: skip
-"""What a session takes for granted and that may be otherwise; each is a family of columns."""
+"""Families of tested columns: assumptions of a session that may be wrong."""

@@ -1,7 +1,7 @@
 """Explanations of rejected poses: a wrong reading, or a wrong name.
 
-A measured pose determines the readings of all motors. Where a configuration is an outlier and all
-of its readings but one agree with its poses, that reading is wrong; where its poses agree with the
+A measured pose determines the readings of all motors. If a configuration is an outlier and all but
+one of its readings agree with its poses, that reading is wrong; if its poses agree with the
 readings of another configuration, names were exchanged. The estimate rejects either, so the result
 is right, and a warning names the cause. Hypotheses are transformations of the readings
 (:mod:`pkmcal.outcome.hypotheses`), each with the absolute test that the configuration is then no
@@ -41,10 +41,11 @@ from pkmcal.wording import listed
 
 
 class MeasuredPlatforms(NamedTuple):
-    """Platform poses by n measured poses.
+    """Platform poses from n measured poses.
 
-    configuration : (n,). T_base_platform : (n, 4, 4). noise : covariance (n, m, m) of the readings
-    that follow from each pose by inverse kinematics.
+    configuration : (n,).
+    T_base_platform : (n, 4, 4).
+    noise : (n, m, m) covariance of the readings that follow from each pose by inverse kinematics.
     """
 
     machine: Machine
@@ -95,6 +96,7 @@ def outlier_explanations(
     measured = MeasuredPlatforms(
         estimate.machine, measurements.poses.configuration[which], poses, noise
     )
+    # poses that the machine can take, enough for a scale of their differences
     off = measured.differences(joints)
     finite = np.flatnonzero(np.isfinite(off).all(axis=1) & np.isfinite(noise).all(axis=(1, 2)))
     measured, off, which = measured.select(finite), off[finite], which[finite]
@@ -105,6 +107,7 @@ def outlier_explanations(
     if usual > HOPELESS_POSE_SCALE**2:
         return  # no pose fits, so there are no outliers
     measured = measured._replace(noise=usual * measured.noise)
+    # rejected poses that are outliers at that scale
     least = SESSION_FALSE_ALARM.of_test(Search.OUTLIERS, len(which))
     rejected = estimate.pose_weights[which] < INLIER_WEIGHT
     odd = np.unique(measured.configuration[rejected & (_chance(m, squares / usual) < least)])
@@ -126,10 +129,13 @@ def _explained(
     k: int,
     least: float,
 ) -> tuple[Finding | None, int]:
-    """Finding that explains configuration k, None without an explanation, and the configuration
-    with which k is exchanged, or else k.
+    """Explanation of outlier k.
 
-    odd : configurations that are outliers. least : p-value below which a configuration is one.
+    odd : configurations that are outliers.
+    least : p-value below which a configuration is an outlier.
+
+    Returns the finding, None without an explanation, and the configuration with which k is
+    exchanged, k if it is not.
     """
     name, names = session.configurations[k], session.configurations
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
@@ -138,6 +144,7 @@ def _explained(
         tables = np.stack([joints, *(one.apply(joints) for one in hypotheses)])
         out = np.zeros(len(tables))
         concerned = [{k}, *({k, one.facts.get("partner", k)} for one in hypotheses)]
+        # each configuration that a hypothesis changes, without and with the mistake
         for c in set().union(*concerned):
             poses = measured.select(measured.configuration == c)
             rows = [n for n, some in enumerate(concerned) if c in some]
@@ -151,6 +158,7 @@ def _explained(
             out[rows] = np.where(_chance(n_values - freed, squares) < least, -np.inf, out[rows])
         return out[1:]
 
+    # the likeliest mistake, among equally probable ones
     hypotheses = [
         *_wrong_readings(measured, joints, k),
         *(_other_row(k, int(c)) for c in range(len(joints)) if c != k),
@@ -162,6 +170,7 @@ def _explained(
         [EvidenceLevel("readings", ratios)],
     )
     explanations = [one.hypothesis for one in likely(ranked)]
+    # exchanged names, then a wrong reading, then the name of another configuration
     exchanged = [one for one in explanations if "partner" in one.facts]
     if exchanged:
         partner = exchanged[0].facts["partner"]

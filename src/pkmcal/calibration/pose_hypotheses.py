@@ -5,18 +5,17 @@ board or a station that moved between two configurations, and a board of another
 evidence compare them:
 
 - closure: platform poses by the nominal machine and the readings, registered to the measured poses
-  by robot-world/hand-eye calibration in closed form. Milliseconds for each hypothesis; the
-  residuals contain nominal errors.
-- estimate: the joint estimate from the data without the mistake. Seconds for each hypothesis, so
-  only those that closure retains are estimated.
+  by robot-world/hand-eye calibration in closed form. This takes milliseconds for each hypothesis;
+  the residuals contain nominal errors.
+- estimate: the joint estimate from the data without the mistake. This takes seconds for each
+  hypothesis, so only those that closure retains are estimated.
 
-An estimate from readings that contradict the poses takes minutes and is meaningless. So closure is
-evaluated before any estimate: residuals in units of those by nominal errors of the prior's size,
-whose true size is unknown, for the data as stated and under each hypothesis alike; for two
-mistakes at once if one is not enough. An estimate then only confirms what closure prefers.
-
-Hypotheses are compared where one could be reported at all: where the data as stated leave more than
-:func:`~pkmcal.outcome.hypotheses.harmless_misfit`.
+An estimate from readings that contradict the poses takes minutes and is meaningless, so closure is
+evaluated before any estimate. Its residuals, as stated and under each hypothesis, are compared in
+units of those due to nominal errors of the prior's size; the true size of nominal errors is
+unknown. If one mistake is not enough, two at once are tried. An estimate then only confirms what
+closure prefers. Hypotheses are compared only if one could be reported at all: if the misfit as
+stated exceeds :func:`~pkmcal.outcome.hypotheses.harmless_misfit`.
 """
 
 from __future__ import annotations
@@ -68,24 +67,23 @@ from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
 EXPLAINED_POSES_SHARE = 0.85
 """Share of the poses that a hypothesis has to explain; the rest may be outliers."""
 HOPELESS_POSE_SCALE = 50.0
-"""Factor on the poses' noise at which an estimate under a hypothesis is given up after a first
-search: far beyond ``VerdictOptions.too_noisy``."""
+"""Factor on the poses' noise above which an estimate under a hypothesis is abandoned after a first
+search: far above ``VerdictOptions.too_noisy``."""
 
 
 @dataclass(frozen=True)
 class ClosureOptions:
     """Limits of the comparison by closure."""
 
-    # factor by which the errors of any nominal model may exceed its prior sigmas. It is no
-    # consequence of the prior, which a file may state too small: beyond it neither a hypothesis nor
-    # the data as stated are tenable. A motor that stands still while its readings move, or the
-    # reverse, is off by 20 to 50 times as much
+    # largest ratio of a nominal model's errors to its prior sigmas, which a file may state too
+    # small: above it neither a hypothesis nor the data as stated are tenable. A motor that does not
+    # move while its readings change, or the reverse, causes 20 to 50 times as much
     most_nominal_error: float = LARGEST_NOMINAL_ERROR
-    # machines drawn from the prior sigmas for the size of closure residuals by nominal errors: four
-    # draws of some thirty parameters each determine it to a tenth
+    # number of machines drawn from the prior sigmas, for the closure residuals due to nominal
+    # errors: four draws of some thirty parameters each determine their size to a tenth
     draws: int = 4
-    # configurations, spread over all, by which poses and readings are tested for a contradiction,
-    # and in which pairs of mistakes are compared: a thousand pairs in seconds
+    # number of configurations, spread over all, in which poses and readings are tested for a
+    # contradiction, and pairs of mistakes are compared: a thousand pairs in seconds
     configurations: int = 48
 
 
@@ -105,10 +103,13 @@ PoseHypothesis = Hypothesis[PoseCase]
 class Diagnosis(NamedTuple):
     """Decision between the hypotheses about measured poses.
 
-    hypothesis : the mistake; None if no hypothesis explains the poses. log_odds : of the mistake,
-    nats. misfit : rms residual of the poses without the mistake, in stated standard deviations.
+    hypothesis : the mistake; None if no hypothesis explains the poses.
+    log_odds : of the mistake, nats.
+    misfit : root mean square residual of the poses without the mistake, in stated standard
+        deviations.
     movement : (6,) left perturbation (omega, tau) of a board, or a station, that moved; NaN where
-    the data do not determine it. untested : codes and errors of hypotheses without an estimate.
+        the data do not determine it.
+    untested : codes and errors of hypotheses without an estimate.
     rivals : other mistakes that are not excluded.
     """
 
@@ -123,10 +124,14 @@ class Diagnosis(NamedTuple):
 class PoseEvidence:
     """Levels of evidence for the mistakes of one machine's measured poses.
 
-    machine : nominal. null_misfit : of the poses as stated, by an estimate. closure_unit : misfit
-    by closure that nominal errors of the prior's size cause, in stated standard deviations. most :
-    configurations that closure compares; all, if None. estimates, misfits, ratios : by an estimate
-    and by closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
+    machine : nominal.
+    null_misfit : misfit of the poses as stated, by an estimate.
+    closure_unit : closure misfit due to nominal errors of the prior's size, in stated standard
+        deviations.
+    most : number of configurations that closure compares; None for all.
+    estimates, misfits, ratios : results by estimate and by closure for the hypotheses so far, by
+        identity.
+    untested : see :class:`Diagnosis`.
     """
 
     def __init__(
@@ -146,15 +151,15 @@ class PoseEvidence:
         self.untested: list[tuple[str, str]] = []
 
     def harmless(self, hypotheses: Sequence[PoseHypothesis], log_odds: float, n: int = 1) -> float:
-        """Misfit up to which none of the hypotheses, or no n of them at once, can have the
-        log-odds.
-        """
+        """Misfit up to which no hypothesis, or no n of them at once, can reach the log-odds."""
         prior = max(one.log_prior for one in hypotheses)
         return harmless_misfit(self.n_effective, n * prior, log_odds)
 
     def by_closure(self, hypotheses: Sequence[PoseHypothesis]) -> Array:
-        """Log-likelihood ratios by closure, minus infinity for mistakes in the readings that are
-        less likely than none, and for all but the best variant of an explanation.
+        """Log-likelihood ratios by closure.
+
+        Minus infinity for mistakes in the readings that are less likely than none, and for all but
+        the best variant of an explanation.
         """
         cases = [one.apply(PoseCase(self.measurements)).measurements for one in hypotheses]
         few = [spread_over(case, self.most) for case in (self.measurements, *cases)]
@@ -165,12 +170,12 @@ class PoseEvidence:
         for k, (one, misfit) in enumerate(zip(hypotheses, misfits[1:], strict=True)):
             if misfit < misfits[1 + best.setdefault(one.meaning, k)]:
                 best[one.meaning] = k
-        # of a motor's constants the best is enough: its offset, estimated, takes up the rest
+        # the best constant of a motor is enough, because an estimate corrects it by the offset
         retained = np.isin(np.arange(len(values)), list(best.values()))
         ratios = np.array(values) - null
         self.ratios = {id(one): r for one, r in zip(hypotheses, ratios.tolist(), strict=True)}
-        # a mistake in the readings moves the platform by far more than nominal errors do, so
-        # closure shows it; a movement or a size may be less, and is estimated in any case
+        # A mistake in the readings has a far larger effect than nominal errors, so closure detects
+        # it; a movement or a size may have a smaller one, and is estimated in any case.
         prior = np.array([one.log_prior for one in hypotheses])
         readings = np.array([one.code.startswith("readings.") for one in hypotheses])
         return np.where(retained & (~readings | (ratios + prior > 0)), ratios, -np.inf)
@@ -190,8 +195,10 @@ class PoseEvidence:
 
     @property
     def by_confirmation(self) -> EvidenceLevel[PoseHypothesis]:
-        """Level of evidence by joint estimates where the data as stated have none: an estimate
-        compares hypotheses with each other, and closure the best of them with the null hypothesis.
+        """Levels of evidence from joint estimates where the data as stated have no estimate.
+
+        Estimates compare hypotheses with each other; closure compares the best hypothesis with the
+        null hypothesis.
         """
 
         def ratios(hypotheses: Sequence[PoseHypothesis]) -> Array:
@@ -204,10 +211,11 @@ class PoseEvidence:
         return EvidenceLevel("estimate", ratios)
 
     def estimate(self, hypothesis: PoseHypothesis, hopeless: float = np.inf) -> Estimate:
-        """The estimate from the data as they would be without the mistake.
+        """Estimate from the data without the mistake.
 
-        hopeless : factor on the poses' noise from which it is given up after a first search. Raises
-        one of NO_ESTIMATE where there is none.
+        hopeless : factor on the poses' noise above which it is abandoned after a first search.
+
+        Raises one of NO_ESTIMATE where there is none.
         """
         case = hypothesis.apply(PoseCase(self.measurements))
         start = case.start or start_from_poses(self.machine, case.measurements)
@@ -216,7 +224,7 @@ class PoseEvidence:
         )
 
     def beside(self, first: PoseHypothesis) -> Diagnosis:
-        """A second mistake, of any kind, beside a first one in the readings."""
+        """Second mistake, of any kind, in addition to a first one in the readings."""
         try:
             value = self.estimate(first)
         except NO_ESTIMATE as error:
@@ -243,10 +251,10 @@ class PoseEvidence:
         return Diagnosis(hypothesis, best.log_odds, pose_misfit(value), movement, untested, rivals)
 
     def _with_constants(self, hypothesis: PoseHypothesis, estimate: Estimate) -> PoseHypothesis:
-        """The hypothesis with the constants (m or rad) of its reversed motors as estimated.
+        """Hypothesis with the constants (m or rad) of its reversed motors as estimated.
 
-        The values follow from the estimated platform poses by the nominal machine, whose offset the
-        corrected readings are read with.
+        The values follow from the estimated platform poses by the nominal machine, whose offset
+        applies to the corrected readings.
         """
         if parts := hypothesis.facts.get("parts"):
             if any("order" in one.facts or "step" in one.facts for one in parts):
@@ -273,10 +281,12 @@ def diagnose(
     estimate: Estimate,
     richer_misfit: float = np.inf,
 ) -> Diagnosis:
-    """Mistake by which poses disagree with the machine, by closure and estimates.
+    """Mistake that explains why poses disagree with the machine, by closure and estimates.
 
-    machine : nominal. estimate : of these measurements. richer_misfit : of the poses by another
-    model of the mechanism file, in stated sigmas: a mistake has to explain more than that model.
+    machine : nominal.
+    estimate : of these measurements.
+    richer_misfit : misfit of the poses with another model of the mechanism file, in stated sigmas:
+        a mistake has to explain more than that model.
     """
     if not np.any(measurements.on_platform[measurements.poses.mount]):
         return Diagnosis()  # poses of boards on the base alone
@@ -285,7 +295,7 @@ def diagnose(
     if evidence.null_misfit <= evidence.harmless(hypotheses, OPTIONS.report):
         return Diagnosis()
     levels = (
-        # nominal errors are in these residuals, so closure drops hypotheses and confirms none
+        # residuals contain nominal errors, so closure discards hypotheses but confirms none
         EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most),
         evidence.by_estimate,
     )
@@ -299,18 +309,20 @@ def diagnose_by_closure(
     unit: float,
     options: ClosureOptions = CLOSURE,
 ) -> Diagnosis:
-    """Mistake in the readings by which poses contradict them, with a second mistake of any kind if
-    a single one does not explain the poses.
+    """Mistake in the readings that explains why poses contradict them, by closure alone.
 
-    misfit : of the poses as stated by closure, in stated standard deviations. unit : of
-    :func:`nominal_misfit`.
+    With a second mistake of any kind if a single one does not explain the poses.
+
+    misfit : closure misfit of the poses as stated, in stated standard deviations.
+    unit : as returned by :func:`nominal_misfit`.
     """
     evidence = PoseEvidence(machine, measurements, misfit, unit)
     closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
     single = reading_mistakes(machine, measurements)
     contradicted = misfit > options.most_nominal_error * unit
     for number in (1, 2):
-        # to skip the estimate from the data as stated is an action
+        # a decision here replaces the estimate from the data as stated, so it needs log-odds of
+        # ``act``
         if misfit <= evidence.harmless(single, OPTIONS.act, number) * unit:
             break
         hypotheses = single if number == 1 else [*_pairs(single, measurements)]
@@ -330,18 +342,20 @@ def diagnose_by_closure(
 
 
 def effective_sample_size(machine: Machine, measurements: Measurements) -> float:
-    """Number of independent residuals of measured poses.
+    """Effective sample size of measured poses.
 
-    The six numbers of a pose share its errors and count once. Errors that an imperfect model leaves
-    vary smoothly over the workspace, so there are no more independent ones than the machine has
-    free parameters.
+    The six numbers of a pose have common errors and count once. Errors of an imperfect model vary
+    smoothly over the workspace, so the number is at most that of the machine's free parameters.
     """
     return float(min(len(measurements.poses), machine.parameters.free_matrix().shape[1]))
 
 
 def pose_misfit(estimate: Estimate) -> float:
-    """Root mean square residual of the better EXPLAINED_POSES_SHARE of the poses, rejected or not,
-    in their stated standard deviations: outliers with another cause should hide nothing.
+    """Root mean square residual of the better EXPLAINED_POSES_SHARE of the poses, in stated
+    standard deviations.
+
+    Rejected poses are included; the worst poses are not, because they may be outliers with another
+    cause.
     """
     errors = estimate.pose_residuals * estimate.statistics.pose_scale
     return float(_usual(np.mean(errors**2, axis=1)[None])[0])
@@ -368,17 +382,17 @@ def spread_over(measurements: Measurements, most: int | None) -> Measurements:
 
 
 def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
-    """Misfits (N,), as of :func:`pose_misfit`, of N cases of measurements with platform poses by
-    the nominal machine and the readings.
+    """Misfits (N,), as :func:`pose_misfit`, of N cases with platform poses by the nominal machine
+    and the readings.
 
-    Each pair of a station and a mount on the platform is registered by itself, by the best of the
+    Each pair of a station and a mount on the platform is registered separately, by the best of the
     closed forms. Cases may differ in their readings and in their poses' stations, mounts and
     values.
     """
     joints = np.stack([case.joints for case in cases])
     fk = machine.forward_result(joints.reshape(-1, joints.shape[-1])).T_base_platform
     body = fk.reshape(*joints.shape[:2], 4, 4)
-    # where loops do not close, the nearest pose is off by as much as the readings are wrong
+    # if loops do not close, the nearest pose is used: its error is as large as that of the readings
     body = np.where(np.isfinite(body).all(axis=(-1, -2), keepdims=True), body, np.eye(4))
     out = np.zeros(len(cases))
     shared: dict[tuple[bytes, bytes], list[int]] = {}  # cases that are registered together
@@ -401,9 +415,11 @@ def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
 
 def _laid(body: Array, observed: Array, whiten: Array) -> Array:
     """Mean squares (N, n) of the whitened residuals of N runs of n poses of one station and mount,
-    by the closed form that leaves least.
+    by the closed form with the smallest residuals.
 
-    body : T_base_platform (N, n, 4, 4). observed : T_station_target. whiten : (n, 6, 6).
+    body : T_base_platform (N, n, 4, 4).
+    observed : T_station_target (N, n, 4, 4).
+    whiten : (n, 6, 6).
     """
     squares: list[Array] = []
     for pair in closed_forms(body, observed):
@@ -422,10 +438,12 @@ def nominal_misfit(
     enough: float = np.inf,
     options: ClosureOptions = CLOSURE,
 ) -> float:
-    """Misfit by closure, as of :func:`closure_misfits`, of machines drawn from the prior sigmas, in
-    stated standard deviations; at least 1, that of the noise.
+    """Closure misfit (:func:`closure_misfits`) of machines drawn from the prior sigmas, in stated
+    standard deviations.
 
-    enough : a lower bound is returned once it is no less, after one draw as a rule.
+    At least 1, the misfit due to noise.
+
+    enough : a lower bound is returned as soon as it is at least this value, usually after one draw.
     """
     squares, unit = 0.0, 1.0
     if unit >= enough:
@@ -571,7 +589,8 @@ def _changed(index: Integers, rows: Integers, value: int) -> Integers:
 def _jump(measurements: Measurements, estimate: Estimate, rows: Integers) -> int:
     """Number of poses before a jump of the board on the platform.
 
-    The split that leaves the least spread about the two parts' medians, all six numbers in units of
+    The split with the smallest spread about the medians of the two parts, all six numbers in units
+    of
     their own spread. rows : (n,) of one station and one mount, in the order of configurations.
     """
     poses, state = measurements.poses, estimate.state
@@ -634,7 +653,7 @@ def _sizes(
 def explain_closure(
     session: Session, boards: Boards, options: ClosureOptions = CLOSURE
 ) -> Explanation:
-    """Mistake in the readings by which measured poses contradict them, if any.
+    """Mistake in the readings that explains why measured poses contradict them, if any.
 
     Evaluated before any estimate: an estimate from such readings takes a thousand steps and does
     not converge.
@@ -663,10 +682,10 @@ def explain_poses(
     estimate: Estimate,
     richer: RicherModel | None = None,
 ) -> Explanation:
-    """Mistake by which poses disagree with the machine, if any.
+    """Mistake that explains why poses disagree with the machine, if any.
 
-    richer : model of the mechanism file that explains the poses; where they agree with that model,
-    no hypothesis is compared.
+    richer : model of the mechanism file that explains the poses. If they agree with that model, no
+        hypothesis is compared.
     """
     if not estimate.pose_weights.size:
         return Explanation()
@@ -681,11 +700,13 @@ def explain_poses(
 def _explanation(
     session: Session, diagnose: Callable[[], Diagnosis], misfit: float, tenable: bool
 ) -> Explanation:
-    """Explanation with the error that names a diagnosis's mistakes and their rivals.
+    """Error for the hypothesis that a diagnosis selects, with its rivals, and its log-odds.
 
-    A reading that never changes precedes all other mistakes, because its effect may equal that of
-    any of them. misfit : of the poses as stated, in stated sigmas. tenable : whether the data as
-    stated may be right in spite of it.
+    An encoder whose reading never changes precedes all other hypotheses, because its effect may
+    equal that of any of them.
+
+    misfit : of the poses as stated (RMS), in stated sigmas.
+    tenable : whether the data as stated are not rejected at this misfit.
     """
     frozen = frozen_in(session)
     if frozen and not tenable:

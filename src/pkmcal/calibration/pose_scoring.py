@@ -53,22 +53,22 @@ from pkmcal.session.load import Session
 class PoseScoringOptions:
     """Constants of the scores of an image's candidate poses with a known machine."""
 
-    # candidate poses that are scored at most, and how many measurements one may be behind the best:
-    # its odds are then one in a hundred thousand
+    # largest number of candidate poses that are scored, and their largest difference from the best
+    # log-likelihood ratio, in measurements: the odds are then one in a hundred thousand
     candidates: int = 8
     most_behind_best: float = 12.0
-    # poses around which likelier ones are searched, once other images have determined the machine
+    # number of poses that are refined locally, once other images have determined the machine
     refined_locally: int = 4
     # ratio by which the number of images that determine the machine must grow before likelier poses
     # are searched around those of all of them, instead of the new ones only
     refined_again_growth: float = 1.25
-    # measurement passes of silhouettes, each from the estimate before: the nominal model is off by
-    # pixels, a machine that images have determined is not
+    # measurement passes of silhouettes, each from the previous estimate: from the nominal model,
+    # which has errors of pixels, and from a machine that images have determined
     passes_from_nominal: int = 4
     passes_from_prior: int = 2
-    # largest scatter of silhouettes about image edges, pixels of the finest tables: a whole leg is
-    # measured no less accurately, and the nominal model's errors are explained by then. By chance
-    # legs lie near image edges; they do not lie on them
+    # largest scatter of silhouettes about image edges, pixels of the finest tables: the accuracy of
+    # the search of a whole leg. Errors of the nominal model are explained before, and chance
+    # matches have a larger scatter
     silhouette_scatter: float = legs.LEG_SEARCH_OPTIONS.sigma
 
 
@@ -198,7 +198,8 @@ def rescore_poses(
     others: Array,
     scores: ScoredPoses | None = None,
 ) -> tuple[PoseHypotheses, ScoredPoses]:
-    """Pose hypotheses of one image, weighted by what is known of the machine, and their scores.
+    """Pose hypotheses of one image, weighted by the present knowledge of the machine, and their
+    scores.
 
     The hypotheses are sorted; their log-likelihood ratios are in unit 1.
 

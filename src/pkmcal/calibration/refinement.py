@@ -70,10 +70,10 @@ class RefinementOptions:
     # upper bound of the measurement passes
     most_passes: int = 9
     # largest change of a converged machine by a measurement pass, root mean square over the
-    # determined directions, in standard deviations. The second pass changes it by one half or one,
-    # and passes over polished legs, which measure other edges each time, by one every time. A
-    # camera that starts centimetres off and moves slowly towards its pose predicts edges that
-    # agree, but each pass changes the machine by four or more
+    # determined directions, in standard deviations. The second pass usually causes a half to one,
+    # and each pass over polished legs one, because it measures other edges. With a camera that
+    # starts centimetres off and converges slowly, predicted and measured edges agree, but each pass
+    # changes the machine by four or more
     settled_change: float = 2.0
     # the same for ending after the second pass: if that changes the machine by more, a further pass
     # reduces the remaining dependence on the starting point to a quarter
@@ -82,8 +82,8 @@ class RefinementOptions:
     # nothing: the first pass corrects a pixel, the second the remaining effect of shading, and
     # profiles reach ten times as far
     settled_distance: float = PROFILE_OPTIONS.shift_reach / 10
-    # the same (px), of the first pass, above which its edges may be those of other objects: edges
-    # found by chance are uniform over the profiles' reach, so that their median is half of it
+    # median distance (px) in the first pass above which its edges may belong to other objects:
+    # chance matches are uniform over the profiles' reach, with a median of half of it
     astray_distance: float = PROFILE_OPTIONS.shift_reach / 3
     # imputations, measurement passes from machines drawn from the estimate's distribution, an even
     # number: with some thirty parameters in each, the standard deviations that they enlarge are
@@ -115,10 +115,13 @@ _POINT_OFF = "the measurement lies {:.0f} standard deviations from where all oth
 class RefinementResult(NamedTuple):
     """Estimate of the last measurement pass, with its inputs.
 
-    images : as they were measured, with their binning. blur : of their edges, px, by station.
-    scatter : of coarse edges, see :class:`PriorScene`. start : initial state of the last estimate.
-    change : of the machine by the last pass, in its standard deviations, as
-    ``RefinementOptions.settled_change``. failures : why imputations gave no estimate.
+    images : as they were measured, with their binning.
+    blur : blur of their edges, px, by station.
+    scatter : scatter of coarse edges, see :class:`PriorScene`.
+    start : initial state of the last estimate.
+    change : change of the machine by the last pass, in its standard deviations, as
+        ``RefinementOptions.settled_change``.
+    failures : reasons why imputations have no estimate.
     """
 
     observation: Observation
@@ -176,10 +179,12 @@ def refine_alternating(
         passes, images, blur = _checked_pass(
             session, images, estimate, blur, scatter, cameras.active, done, options
         )
-        measurements = measurements_of(session, boards, _edges(passes, options), cameras)
+        edges = _edges(passes, options)
+        measurements = measurements_of(session, boards, edges, cameras, estimate)
         lap("observe")
         now("Identifying", 0.3)
         before = estimate
+        # next estimate, from a new start if the first pass may have measured other objects
         start, shifted = (
             _without_camera_changes(estimate.state),
             max(station_edges.shift for station_edges in passes),
@@ -191,6 +196,7 @@ def refine_alternating(
         lap("identify")
         if turn == 0:
             now("Comparing the responses of images", 0.7)
+            # other responses are tested once; with them, edges are measured again
             responses = _responses(case, images, measurements, before, estimate, cameras, blur, lap)
             if results := responses.by_entry:
                 images = [
@@ -199,6 +205,7 @@ def refine_alternating(
                 ]
                 blur = {}
                 continue
+        # convergence, at full resolution
         usual = shifted < options.settled_distance and not cameras.active
         last = turn + 1 >= options.passes
         if usual or last:
@@ -229,7 +236,8 @@ def _responses(
 ) -> ResponseComparison:
     """Response of each camera's images to light, by the edges of the first pass.
 
-    before : predicted the edges of ``measurements``; estimate : from these edges.
+    before : estimate that predicted the edges of ``measurements``.
+    estimate : from these edges.
     """
 
     def measured(some: list[StationImages], blur: BlurByStation) -> EdgeSet:
@@ -258,19 +266,20 @@ def imputation_variance(
 ) -> RefinementResult:
     """Add the variance due to the choice of edges to the covariance, by multiple imputation.
 
-    Where two borders lie side by side, the prediction decides which of them is taken for the leg's
-    edge. No residual shows a wrong choice, because all edges of a pass agree with the machine that
-    predicted them. So edges are measured again from machines drawn from the estimate's
+    Where two borders lie side by side, the prediction determines which of them is measured as the
+    leg's edge. No residual reveals a wrong choice, because all edges of a pass agree with the
+    machine that predicted them. So edges are measured again from machines drawn from the estimate's
     distribution, and the variance between their estimates is added to the variance of one (Rubin,
-    Multiple imputation for nonresponse in surveys, 1987, 3.1). The first pass is kept, not the
-    mean, so that residuals and weights are those of the reported estimate. The estimates hardly
-    follow the machines that were drawn, so they count as independent, antithetic pairs too. Edges
-    of painted legs from a tripod do not depend on the prediction, and nothing is repeated.
+    Multiple imputation for nonresponse in surveys, 1987, 3.1). The estimate itself is that of the
+    first pass, not the mean, so that residuals and weights are those of the reported estimate. The
+    estimates depend little on the drawn machines, so antithetic pairs count as independent too.
+    Edges of painted legs from a tripod do not depend on the prediction, and nothing is repeated.
     """
     session, estimate, options = case.session, turns.estimate, turns.options
     by_hand = any(session.stations[p.station].handheld for p in turns.images)
     if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
         return turns
+    # estimates from edges that drawn machines predict
     offsets: list[Array] = []
     failures: list[str] = []
     for number, drawn in enumerate(_as_likely(session, estimate, options.imputations, rng)):
@@ -282,12 +291,14 @@ def imputation_variance(
             passes = _measurement_pass(
                 session, images, drawn, turns.blur, turns.scatter, cameras.active
             )
-            measurements = measurements_of(session, case.boards, _edges(passes, options), cameras)
+            edges = _edges(passes, options)
+            measurements = measurements_of(session, case.boards, edges, cameras, estimate)
             ended = bundle(session.machine, measurements, _without_camera_changes(drawn.state))
         except (PkmcalError, np.linalg.LinAlgError) as error:
             failures.append(str(error))
             continue
         offsets.append(ended.state.theta)
+    # between-imputation variance, relative to that by noise, in the covariance of the first pass
     variance = 1.0  # as large as the noise's, if fewer than two imputations gave an estimate
     if len(offsets) > 1:
         apart = np.stack(offsets) - np.mean(offsets, axis=0)
@@ -399,8 +410,10 @@ def _blur_of(
 def _width_of_edges(
     images: Sequence[StationImages], estimate: Estimate, count: int
 ) -> dict[int, float]:
-    """Blur (px) by station, from the width of the edges in ``count`` images: profiles determine no
-    blur that is wider than themselves. Stations whose edges do not determine it are absent.
+    """Blur (px) by station, from the width of the edges in ``count`` images.
+
+    For blurs wider than the profiles, which these do not determine. Stations whose edges do not
+    determine it are absent.
     """
     out: dict[int, float] = {}
     for p in images:
@@ -464,8 +477,8 @@ def initial_guess(machine: Machine, measurements: Measurements, prior_state: Sta
     """``prior_state``, or the state by [A]'s four steps if that explains the edges better.
 
     The four steps need no initial guess, so they recover from a nominal model or an earlier
-    estimate that is far off. Compared by the median misfit, which is robust to wrong edges. Where
-    the steps refuse the data, ``prior_state`` remains.
+    estimate that is far off. The median misfit, which is robust to wrong edges, decides. If the
+    steps cannot be applied, ``prior_state`` is returned.
     """
     from pkmcal.identify.methods.four_step import four_step
 
@@ -486,7 +499,8 @@ def identify_poses(
 ) -> RefinementResult:
     """Identification by boards, trackers and links alone.
 
-    Their measurements do not depend on the estimate, except through refined cameras.
+    Their measurements do not depend on the estimate, except through refined cameras and effects on
+    the readings.
     """
     progress("Identifying", 0.0)
     machine = session.machine
@@ -494,19 +508,20 @@ def identify_poses(
     start = start_state(machine, measurements, T_camera_base, session.forward)
     start = _feasible_start(session, measurements, start)
     estimate = bundle(machine, measurements, start)
-    for turn in range(1, options.passes if cameras.active else 1):
-        progress("Identifying with the cameras", turn / options.passes)
+    turns = options.passes if cameras.active else 2 if measurements.effects else 1
+    for turn in range(1, turns):
+        progress("Identifying again", turn / turns)
         cameras = cameras.updated(estimate)
-        measurements = measurements_of(session, boards, None, cameras)
+        measurements = measurements_of(session, boards, None, cameras, estimate)
         estimate = bundle(machine, measurements, _without_camera_changes(estimate.state))
     observation = observation_of(session, [], boards, measurements, estimate)
     return RefinementResult(observation, measurements, estimate, cameras, options=options)
 
 
 def _feasible_start(session: Session, measurements: Measurements, start: State) -> State:
-    """Initial state with all configurations closed: where the nominal model does not close at all
-    readings, by an estimate from the others.
+    """Initial state with all configurations closed.
 
+    Where the nominal model does not close at all readings, by an estimate from the other readings.
     Raises `InputError` for readings at which that estimate does not close either.
     """
     drawn = session.forward.converged
@@ -537,13 +552,14 @@ def _first_estimate(
     lap: Callable[[str], None],
     options: RefinementOptions,
 ) -> Estimate:
-    """Estimate by whole legs, to a pixel.
+    """Estimate from whole legs, accurate to a pixel.
 
-    Images by hand have edges from their localization. In others, legs are searched as wholes
-    around their prediction, and, unless nearly all agree with the estimate, once more around its
+    Hand-held images have edges from their localization. In others, whole legs are searched around
+    their prediction and, unless nearly all agree with the estimate, once more around the estimate's
     own prediction.
     """
     session, images, boards, scene = case
+    # hand-held images have their edges already
     begin = partial(
         start_state,
         scene.machine,
@@ -615,10 +631,10 @@ def _with_silhouettes(
     images: StationImages,
     edges: legs.StationEdges,
 ) -> legs.StationEdges:
-    """Edges of an image by hand, with coarse silhouettes in place of edges that were not measured.
+    """Edges of a hand-held image, with coarse silhouettes in place of edges that were not measured.
 
-    The pose of such an image is determined by its own few edges, so none should be missing.
-    scatter : standard deviation of the coarse ones, relative to the stated one.
+    The pose of such an image is determined by its own few edges, so none should be missing. scatter
+    : ratio of the standard deviation of the coarse edges to the stated one.
     """
     if not session.stations[images.station].handheld:
         return edges
@@ -686,11 +702,12 @@ def observation_of(
     estimate: Estimate,
     images: Sequence[StationImages] = (),
 ) -> Observation:
-    """Joined edges of the last pass, with those that the estimate rejected among the rejected.
+    """Concatenated edges of the last pass, with those that the estimate rejected as rejections.
 
     images : as they were measured.
     """
-    # a station that observes a board alone has its camera's, because they share the edge shift
+    # a station that observes only a board has the binning of its camera's other stations, because
+    # they share the edge shift
     of_camera = {session.stations[p.station].camera_file: p.binning for p in images}
     binning = np.ones(len(estimate.state.T_camera_base), dtype=int)
     for k, station in enumerate(session.stations):
@@ -721,7 +738,7 @@ def observation_of(
 def _rejected_poses(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[Rejection, ...]:
-    """Poses that do not fit the rest, with how far they lie off."""
+    """Rejected poses, with their distances from the predictions."""
     poses = measurements.poses
     lost = np.flatnonzero(estimate.pose_weights < INLIER_WEIGHT)
     error = np.linalg.norm(estimate.pose_residuals, axis=1)

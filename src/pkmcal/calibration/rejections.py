@@ -1,4 +1,6 @@
-"""Findings about rejected heights, boards and images, and about results that rest on these."""
+"""Findings about rejected heights, boards and images, and about results that depend on
+rejections.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ def rejection_findings(
     *,
     at_minimum: bool,
 ) -> Iterator[Finding]:
-    """Warnings that name the rejected units of an estimate, and a reason where the result rests on
+    """Warnings that name the rejected units of an estimate, and a refusal if the result depends on
     an unconfirmed rejection.
 
     at_minimum : whether the estimate is at the minimum of the joint problem, as hypotheses about it

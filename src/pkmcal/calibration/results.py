@@ -154,11 +154,12 @@ def calibration_document(
     over: ToolMap | str | None = None,
     images: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Any]:
-    """The content of calibration.json, plain data without NaN and dates.
+    """Content of calibration.json, plain data without NaN and dates.
 
-    not_identified : sentences about unidentifiable directions, as in the report. holdout :
-    residuals of held-out configurations, beside those in use. over : the tool over the workspace,
-    or why there is no map of it. images : digests of the images, computed unless given.
+    not_identified : sentences about unidentifiable directions, as in the report.
+    holdout : residuals of held-out configurations, besides those in use.
+    over : tool over the workspace, or why there is no map of it.
+    images : digests of the images, computed by default.
     """
     session, estimate = calibration.session, calibration.estimate
     bed = calibration.identification.bed
@@ -276,9 +277,11 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _station_covariance(calibration: Calibration) -> dict[str, Any]:
-    """Stations in which a camera may stay, by name, and their rows (6 k, P + 6 k) of the joint
-    covariance of all parameters and these stations, (omega, tau) of T_base_camera. Stations whose
-    pose is determined in part, as of a probe of heights or of orientations, are left out.
+    """Joint covariance of all parameters with stations whose camera may stay in place.
+
+    Names of the stations, and their rows (6 k, P + 6 k) of the covariance of all parameters and
+    these stations, (omega, tau) of T_base_camera. Stations with a partly determined pose, such as a
+    probe of heights or orientations, are omitted.
     """
     session, estimate = calibration.session, calibration.estimate
     nowhere = {station.name for station in session.stations if station.handheld}

@@ -404,6 +404,7 @@ def load(source: Path | str) -> SavedCalibration:
         if len(one.joints) != machine.n_joints:
             wanted = f"the {machine.n_joints} readings of its machine, not {len(one.joints)}"
             raise _edited(document, f"configurations[{k + 1}].joints", wanted)
+    # covariance with the stations, and the result
     placed, joint = _covariance(document, saved)
     return SavedCalibration(
         path=document.path,

@@ -1,10 +1,10 @@
 """Tubes whose outlines differ from the nominal model: a sleeve, a ring, a cable along a leg.
 
-Each side of a tube has a shift of its own at each station, for light shifts outlines (shading), and
-a tube has a radius with its tolerance. Shifts have Student's distribution: most are small, and a
-line that is far off is let go, so that the machine hardly suffers. What is too far off for any
-light is told: all lines of a tube outward alike are another radius, one line alone is something
-that stands beside the tube.
+In the estimate each side of a tube has an unknown shift at each station, because light shifts
+outlines (shading), and each tube a radius with its prior sigma. The shifts have Student's
+distribution, so a line that is far off has a small weight and hardly affects the machine. Here
+deviations that are too large for shading are tested: a common outward or inward deviation of all
+lines of a tube is another radius, a deviation of one line alone is an object beside the tube.
 """
 
 from __future__ import annotations
@@ -25,16 +25,19 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.session.load import Session
 
 DISTANCE_SAMPLE_EDGES = 4000
-"""Edges, evenly of all, from which the distance of each line is computed."""
+"""Number of edges, spread over all, from which the distances of the lines are computed."""
 OF_MEDIAN = 1.25
-"""Standard deviation of a median, over that of a mean, of normal numbers."""
+"""Ratio of the standard deviation of a median to that of a mean, for normal numbers."""
 OF_MIDDLE = 1.48
-"""Standard deviation of normal numbers in the median of their distances from the middle."""
+"""Ratio of the standard deviation to the median absolute deviation, for normal numbers."""
 
 
 class Outline(NamedTuple):
-    """A tube's departure, its score by its own distribution, and the value that the middle of its
-    lines tells, m, of which some may be other than the rest; sigma : its standard deviation.
+    """A tube's model violation.
+
+    column, score : its column, and its score by its own distribution.
+    value, sigma : m, median over the tube's lines, some of which may be partly covered, and its
+        standard deviation.
     """
 
     column: Column
@@ -49,7 +52,8 @@ def outlines(
     estimate: Estimate,
     false_alarm: FalseAlarm = SESSION_FALSE_ALARM,
 ) -> Iterator[Outline]:
-    """Tubes of another radius than drawn, then single lines that are off, the surest first.
+    """Tubes with another radius than nominal, then single lines that are off, the most significant
+    first.
 
     Tubes and lines have half of the search's level each.
     """
@@ -64,6 +68,7 @@ def outlines(
     table, file = session.machine.parameters, session.document["mechanism"]
     grown = estimate.machine.values - table.nominal
     station, leg, tube = keys[:, :3].T
+    # radius of each tube: change of the estimated radius plus the shift of each line
     tubes = np.unique(keys[:, 1:3], axis=0)
     edge = float(np.max(estimate.column_sigma(EDGE_SHIFT), initial=0.0))
     results: list[tuple[Score, Integers, float, float]] = []
@@ -72,7 +77,8 @@ def outlines(
         radius = session.machine.layout.radius[j][t]
         each = grown[radius] + shift[mine] * size[mine]
         if not (each > 0).all() and not (each < 0).all():
-            continue  # another radius moves all alike
+            continue  # another radius moves all lines to the same side
+        # test of their median, against noise, camera shift and the radius's prior
         value = float(np.median(each))
         own = OF_MEDIAN * np.median(sigma[mine] * size[mine]) / np.sqrt(len(mine))
         scale = float(np.hypot(own, edge * np.median(size[mine])))
@@ -81,12 +87,13 @@ def outlines(
         score = Score(
             z**2, 1, chance, float(false_alarm.adjusted(Search.OUTLINES, chance, 2 * len(tubes)))
         )
-        # as told: lines of one tube can be as unlike as its light and what covers it
+        # reported sigma: at least the scatter of the lines, which may be partly covered
         spread = OF_MEDIAN * OF_MIDDLE * np.median(np.abs(each - value)) / np.sqrt(len(mine))
         results.append((score, mine, value, float(max(scale, spread))))
     thick = sorted(
         (one for one in results if one[0].adjusted < false_alarm.level), key=lambda x: x[0].chance
     )
+    # tubes of another radius
     outlined: list[int] = []
     for score, mine, value, scale in thick:
         outlined += mine.tolist()
@@ -95,6 +102,7 @@ def outlines(
         name, facts = f"legs[{j + 1}].tubes[{t + 1}]", _tube(j, t, file=file)
         column = Column("tube.radius", name, "tube radius", edges=by, edge_rows=own, facts=facts)
         yield Outline(column, score, value, scale)
+    # single lines of the other tubes, by the distribution of the lines' shading
     z = np.abs(shift) / sigma
     chance = np.where(
         np.isin(np.arange(len(keys)), outlined), 1.0, 2 * stdtr(LINE_SHADING.freedom, -z)
@@ -122,15 +130,17 @@ def _tube(leg: int, tube: int, **more: str) -> Callable[[Array, Array], dict[str
 def _edges_of_lines(
     measurements: Measurements, number: Integers, mine: Integers, size: Array
 ) -> tuple[Integers, Array]:
-    """Edges (n,) of some lines of a tube, and derivatives (n, 2, 1) by metres that it is larger
-    there: they should have been seen farther in.
+    """Edges (n,) of some lines of a tube, and their derivatives (n, 2, 1) by the tube's excess
+    radius, m.
+
+    mine : numbers of the lines. size : metres per pixel on each line.
     """
     own = np.flatnonzero(np.isin(number, mine))
     return own, (-measurements.edges.shift[own] / size[number[own], None])[..., None]
 
 
 def _metres(measurements: Measurements, estimate: Estimate, number: Integers, count: int) -> Array:
-    """Metres (n,) on each line's tube that a pixel is."""
+    """Metres per pixel (n,) on each line's tube."""
     edges, state = measurements.edges, estimate.state
     each, first = np.unique(number, return_index=True)
     some = np.union1d(

@@ -1,9 +1,9 @@
-"""Hypothesis that diameters were written for radii.
+"""Hypothesis that diameters were stated as radii.
 
-Tubes modelled twice as thick are localized all the same: their edges match edges beside the right
-ones, with the camera at another distance. The likelihood of the images does not decide, because
-the highlights of a tube are edges, too, at less than its width. The joint estimate decides: with
-the stated radii few edges are measured, which are chance matches or disagree with the machine,
+A machine with tubes of twice the radius is localized as well: its edges match edges beside the
+right ones, with the camera at another distance. The likelihood of the images does not decide,
+because highlights of a tube are edges at less than its width. The joint estimate decides. With the
+stated radii few edges are measured, which are chance matches or disagree with the machine,
 sometimes by no more than is accepted of a result; with half of the radii more edges are measured,
 and they agree.
 """
@@ -42,18 +42,20 @@ RadiiHypothesis = Hypothesis[Session]
 def explain_radii(
     case: Case, turns: RefinementResult | None, refine_camera: bool, seed: int
 ) -> Explanation:
-    """Diameters for radii, where edges disagree with the machine and more edges agree with half of
-    the radii.
+    """Mistake of diameters stated as radii, if more edges agree with the machine with half of the
+    radii.
 
-    turns : refinement with the stated radii, None without an estimate. refine_camera : whether the
-    cameras are estimated. seed : for the localization of the stations.
+    turns : refinement with the stated radii, None without an estimate.
+    refine_camera : whether the cameras are estimated.
+    seed : for the localization of the stations.
     """
     null = _edge_misfit(turns)
-    # errors of an imperfect model vary smoothly, so no more are independent than it has parameters
+    # errors of an imperfect model vary smoothly, so the effective sample size is at most its number
+    # of parameters
     n_effective = float(case.session.machine.parameters.free_matrix().shape[1])
     prior = log_prior_of_each(case.session.machine, case.session.joints)
-    # edges that scatter no more than those of right sessions need no hypothesis, the evidence for
-    # which costs a localization and a refinement
+    # The evidence costs a localization and a refinement; it is not needed if edges scatter no more
+    # than in right sessions.
     least = max(harmless_misfit(n_effective, prior), VERDICT.edge_scatter)
     if not case.images or null <= least:
         return Explanation()

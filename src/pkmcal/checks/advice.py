@@ -155,6 +155,7 @@ def _lost_edges(
     kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])
     number = {name: int(np.sum(finite & of)) for name, of in kinds.items()}
     kind = max(number, key=lambda name: number[name])
+    # Legs that lose more than their share.
     tubes = tubes_of(inspection.session.machine)
     by_leg = [
         int((lost[:, tubes.leg == j]).sum()) for j in range(inspection.session.machine.n_legs)

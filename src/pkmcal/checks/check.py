@@ -1,8 +1,8 @@
 """Checks of a session before it is calibrated.
 
-All that `load_session` refuses, then what only images show: whether they can be decoded, are well
-exposed and sharp, and whether machine and boards are recognized in them; then what readings and
-measured poses show before a calibration.
+All checks of `load_session`; then checks of the images: whether they can be decoded, are well
+exposed and sharp, and whether machine and boards are localized in them; then checks of the readings
+and measured poses that do not need a calibration.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _check(folder: Path, seed: int, progress: Progress) -> SessionCheck:
     except PkmcalError as error:
         return SessionCheck(str(folder), (of_error(error), *findings))
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
-    progress("Reading images", 0.05)
+    progress("Reading images" if session.stations else "Reading the measurements", 0.05)
     images, broken = _decode_images(session)
     progress("Localizing the stations", 0.1)
     motion = _kinematics(session, np.random.default_rng(seed))
@@ -96,6 +96,7 @@ def _check(folder: Path, seed: int, progress: Progress) -> SessionCheck:
     findings += [*broken, *motion.findings, *observed.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
     findings += numbering_note(session)
+    # Forecast of a full capture.
     progress("What such images will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no station for further images
     expected = None
@@ -186,8 +187,9 @@ def _decode_images(session: Session) -> tuple[list[StationImages | None], list[F
 class _NominalKinematics:
     """Kinematics of the nominal machine at the readings.
 
-    poses : T_base_platform (K, 4, 4), None if the closure fails at some readings. singularity :
-    least over the configurations. assemblies : number of assembly modes at the first readings.
+    poses : T_base_platform (K, 4, 4), None if the closure fails at some readings.
+    singularity : least over the configurations.
+    assemblies : number of assembly modes at the first readings.
     """
 
     poses: Array | None
@@ -222,7 +224,10 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematic
 
 
 class _ImageChecks(NamedTuple):
-    """Results of the images. inspection : None if the machine could not be searched for."""
+    """Results of the checks of the images.
+
+    inspection : None if the machine could not be searched for.
+    """
 
     stations: tuple[StationCheck, ...]
     findings: tuple[Finding, ...]

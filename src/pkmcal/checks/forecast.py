@@ -39,12 +39,14 @@ FORECAST_SEED = 7
 class LegForecast:
     """Forecast for one leg (from 1) at one station.
 
-    seen : share of its edges' points that are not hidden, in all images. found : share of the
-    expected edges that were measured and are inliers, in the first images; NaN without expected
-    ones. sigma : their median standard deviation, px across. tells : share of the information of
-    all edges of the capture on the machine (in units of the prior sigmas). variance : share of the
-    variance of the platform's position that comes from the errors of its edges: a better view of a
-    leg with a large share gains most.
+    seen : share of its edges' points that are not hidden, in all images.
+    found : share of the expected edges that were measured and are inliers, in the first images; NaN
+        without expected edges.
+    sigma : median standard deviation of these edges, px across.
+    tells : share of the information of all edges of the capture on the machine (in units of the
+        prior sigmas) that is due to this leg.
+    variance : share of the variance of the platform's position due to the errors of its edges: a
+        better view of a leg with a large share improves the result most.
     """
 
     station: str
@@ -61,10 +63,12 @@ class Forecast:
     """Predicted accuracy with ``photographs`` images at each station.
 
     position, orientation : standard deviations of the platform's pose at given readings, mean over
-    poses, m and rad, as `calibrate` states them. readings, drawing : shares of the position's
-    variance from readings and priors; the rest comes from edges. second : position, m, if half of
-    the images are taken a quarter turn around the machine; NaN with several stations or a panoramic
-    camera. edges : by station, for advice.
+        poses, m and rad, as `calibrate` states them.
+    readings, drawing : shares of the position's variance from readings and priors; the rest comes
+        from edges.
+    second : position, m, if half of the images are taken a quarter turn around the machine; NaN
+        with several stations or a panoramic camera.
+    edges : by station, for advice.
     """
 
     photographs: int
@@ -163,6 +167,7 @@ def _planned_capture(inspection: Inspection, first: FirstEdges, images: int) -> 
             for k, (s, T, pools) in enumerate(cameras)
         ),
         shading=first.estimate.statistics.shading,
+        temperatures=inspection.session.temperature,
     )
     return _Capture(rig, poses[:wanted], readings[:wanted], np.concatenate(pairs))
 

@@ -1,4 +1,4 @@
-"""Localization of the machine in a check's images, used by its pictures and its forecast."""
+"""Localization of the machine in a check's images, for its pictures and its forecast."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from pkmcal.session.load import Session
 class StationInspection:
     """Station in whose images the machine was searched for.
 
-    name : of the station. images : decoded images; ``station_images.station`` is the station's
-    number. by_hand : T_camera_base (4, 4) of the session, None without one. T_camera_base : (4, 4)
-    end of the search. quality : of the legs, None if the machine was not recognized.
+    name : name of the station.
+    images : decoded images; ``station_images.station`` is the station's number.
+    by_hand : rough pose T_camera_base (4, 4) of the session, None without one.
+    T_camera_base : (4, 4) result of the search.
+    quality : quality of the legs' images, None if the machine was not localized.
     """
 
     name: str

@@ -17,10 +17,14 @@ from pkmcal.outcome.finding import Finding, Level, first_error
 class BoardCheck:
     """Board in the images of one station.
 
-    found : number of images that show it. corners : their mean number in these, of ``corners_of``.
-    rms : distance from the predicted positions, px. scatter : motion in px of a board on the base
-    between images; NaN if it need not be still, or is visible once. distance : m. unseen : outer
-    row or column that no image shows while all others are visible, in words.
+    found : number of images in which the board was detected.
+    corners, corners_of : mean number of corners in these images, and number of corners of the
+        board.
+    rms : root mean square distance of the corners from their predicted positions, px.
+    scatter : motion in px of a board on the base between images; NaN if it need not be at rest, or
+        was detected once.
+    distance : m.
+    unseen : outer row or column that is in no image while all others are visible, in words.
     """
 
     found: int
@@ -36,8 +40,10 @@ class BoardCheck:
 class JointCheck:
     """Readings of one joint.
 
-    unit : m or rad. used : share of its range. ends : numbers of readings near either end of it.
-    NaN and 0 if the mechanism file gives no range.
+    unit : m or rad.
+    used : share of its range.
+    ends : numbers of readings near either end of it. NaN and 0 if the mechanism file gives no
+        range.
     """
 
     name: str
@@ -52,10 +58,13 @@ class JointCheck:
 class StationCheck:
     """Check of one station.
 
-    mismatch : 0 for a perfect match, 1 for none. by_chance : probability that wrong readings match
-    as well. Both are NaN without a search. moved, turned : from the given to the localized pose, m
-    and rad. legs : mean number found in an image. saturated, black : mean shares of the legs'
-    pixels. blur : median, px. board : None if the station observes none or it was not found.
+    mismatch : 0 for a perfect match, 1 for none; NaN without a search.
+    by_chance : probability that wrong readings match as well; NaN without a search.
+    moved, turned : distance (m) and rotation (rad) from the rough to the localized pose.
+    legs : mean number of legs measured in an image.
+    saturated, black : mean shares of the legs' pixels.
+    blur : median, px.
+    board : None if the station observes none, or it was not detected.
     """
 
     name: str
@@ -76,10 +85,11 @@ class StationCheck:
 class SessionCheck:
     """Results of a check.
 
-    singularity : least over the configurations, 1 good, 0 singular. assemblies : number of assembly
-    modes at the first configuration's readings. forecast : accuracy of a full capture, if the first
-    images allow it. advice : improvements. look : localization of the machine for pictures; None if
-    it could not be searched for.
+    singularity : smallest over the configurations, 1 good, 0 singular.
+    assemblies : number of assembly modes at the first configuration's readings.
+    forecast : accuracy of a full capture, if the first images allow it.
+    advice : improvements.
+    look : localization of the machine for pictures; None if it could not be searched for.
     """
 
     folder: str

@@ -26,7 +26,7 @@ from pkmcal.session.readings import same_pose
 from pkmcal.wording import DISPLAY_UNITS, Chance, count, listed, number, with_unit
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
-"""Share of saturated pixels on the legs beyond which edges are lost; a highlight has a tenth."""
+"""Share of saturated pixels on the legs above which edges are lost; a highlight covers a tenth."""
 BLUR_STILL_MEASURED = 1.7
 """Blur (px) beyond which edges are measured badly: the model of an edge ends at 1.5."""
 POOR_CORNERS = 0.5
@@ -126,7 +126,7 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
     if session.heights_alone:  # the bed determines the configurations
         return findings
     crowded = [joint for joint in joints if joint.used < MAJORITY]
-    if crowded:
+    if crowded and not session.of_a_bed:
         names = [joint.name for joint in crowded]
         least = min(joint.used for joint in crowded)
         findings.append(note("readings.crowded", listed(names), columns=names, share=least))

@@ -36,6 +36,10 @@ IMAGES, BOARD = "Images", "Board"
         "simulate", "tolerance", "X", "Standard deviation of the true geometry, in prior sigmas."
     ),
     number("simulate", "joint_noise", "M", "Sigma of a joint reading, m or rad."),
+    number(
+        "simulate", "warming", "K", "Warming of the machine over the session, kelvin; its"
+        " temperatures are then in joints.csv."
+    ),
     option("--plan", "PLAN", "Folder of a plan: its machine, stations and configurations.", Path),
     seed("simulate"),
     option("--camera", "FILE", "Camera file, instead of --size.", Path, group=IMAGES),

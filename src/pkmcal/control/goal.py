@@ -51,16 +51,19 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class Step:
-    """Result of the controller for one sample; m readings, s seen legs.
+    """Result of the controller for one sample; m readings, s observed legs.
 
     joint_velocities : (m,) per second, in the readings' units; zero unless ``status.moves``.
     error : RMS angle, in rad, of the law's error over the legs used; NaN without any.
     remaining : (m,) distance of each reading from the goal, as estimated by the law; NaN if the
-    controller stopped before. sigma : (m,) standard deviation of `remaining` from the image's
-    noise; NaN for edges without covariances. converged : at the goal within the tolerance. status,
-    sentence : the controller's state, for programs and for people. warnings : problems that do not
-    stop the controller. used : (s,) legs that enter the law. normals : (s, 2, 3) measured edges,
-    camera frame.
+        controller stopped before.
+    sigma : (m,) standard deviation of `remaining` due to the image's noise; NaN for edges without
+        covariances.
+    converged : whether the machine is at the goal, within the tolerance.
+    status, sentence : the controller's state, for programs and for people.
+    warnings : problems that do not stop the controller.
+    used : (s,) legs that enter the law.
+    normals : (s, 2, 3) measured edges, camera frame.
     """
 
     joint_velocities: Array

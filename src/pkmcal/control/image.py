@@ -34,7 +34,7 @@ IN_VIEW = 0.5
 
 @dataclass(frozen=True)
 class Eye:
-    """True machine in front of the true camera.
+    """Simulated observation: the true machine in front of the true camera.
 
     tubes : the edges that are measured, E = 2 s, leg by leg in the order of ``true.legs``.
     """

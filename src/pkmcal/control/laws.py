@@ -12,8 +12,8 @@ A_j(q_j), which covers cranks and sliders: with q' = D twist,
     du_j = (I - u u^T) / length (dB_j - dA_j),    dA_j = (dA_j / dq_j) D_j twist,
 
 which is [B] eq. 9 where dA_j / dq_j = 0. Machines with fewer than six degrees of freedom are
-restricted to the twists that they can make. The wanted values are measured as well (the machine was
-at the goal once), so errors of the controller's geometry change the path and not its end.
+restricted to the twists that they can make. The wanted values are measured too, in an image of the
+machine at the goal, so errors of the controller's geometry change the path but not its end.
 """
 
 from __future__ import annotations
@@ -40,8 +40,10 @@ unobservable and is not commanded. Edges of all legs of a hexapod have 0.02 to 0
 class Rates(NamedTuple):
     """Derivatives of readings and hinges by the twist, and the free twists.
 
-    readings : (..., m, 6) D of [B] eq. 6-7. hinges : (..., n, 6). free : (..., 6, f) orthonormal
-    twists (rotations times the platform's radius) that the machine can make.
+    readings : (..., m, 6) D of [B] eq. 6-7.
+    hinges : (..., n, 6).
+    free : (..., 6, f) orthonormal twists (rotations times the platform's radius) that the machine
+        can make.
     """
 
     readings: Array
@@ -221,9 +223,12 @@ def law_named(name: str) -> type[Law]:
 class Task:
     """Linearized control problem at one moment: e changes by ``matrix @ y`` (..., r, f).
 
-    error : (..., r). y : amounts of the free twists in metres, rotations as the displacement of the
-    platform's joints. twist : (..., 6, f). readings : (..., m, f) derivatives by y. legs : limbs of
-    the controller's model.
+    error : (..., r).
+    y : amounts of the free twists in metres, rotations as the displacement of the platform's
+        joints.
+    twist : (..., 6, f).
+    readings : (..., m, f) derivatives by y.
+    legs : limbs of the controller's model.
     """
 
     error: Array
@@ -304,10 +309,13 @@ def joint_velocities(
 ) -> Array:
     """Motor velocities -gain D N+ e, (..., m) per second; errata, "Servoing".
 
-    law : "directions" or "edges". measured, goal : (..., s, 2, 3) unit normals of the seen legs'
-    edges, camera frame, sides as in :mod:`pkmcal.geometry.cylinders`. readings : (..., m). gain :
-    1/s. at : where N is evaluated; "goal" and "mean" need goal_readings (..., m). NaN where an edge
-    is undefined, or a limb cannot be at its reading.
+    law : "directions" or "edges".
+    measured, goal : (..., s, 2, 3) unit normals of the seen legs' edges, camera frame, sides as in
+        :mod:`pkmcal.geometry.cylinders`.
+    readings : (..., m).
+    gain : 1/s.
+    at : where N is evaluated; "goal" and "mean" need goal_readings (..., m). NaN where an edge is
+        undefined, or a limb cannot be at its reading.
     """
     legs = legs_from_image(view, directions_of(measured), readings)
     goal_legs = None
@@ -318,9 +326,7 @@ def joint_velocities(
 
 
 def limited(speeds: Array, fastest: Array | float | None) -> Array:
-    """Velocities (..., m) with a common factor so that none exceeds its limit; the direction is
-    kept.
-    """
+    """Velocities (..., m) scaled by a common factor so that none exceeds its limit."""
     if fastest is None:
         return speeds
     with np.errstate(invalid="ignore"):

@@ -81,9 +81,12 @@ NO_EDGES_TEXT = (
 class _Sample:
     """One sample of the control loop.
 
-    normals : (s, 2, 3) edges of the seen legs. readings : (m,). reasons : (s,) why legs are
-    missing. lines : lines of the legs, for a sample from an image. pose : (4, 4) from the readings,
-    if computed. beside : m by which the image contradicts the readings.
+    normals : (s, 2, 3) edges of the seen legs.
+    readings : (m,).
+    reasons : (s,) why legs are missing.
+    lines : lines of the legs, for a sample from an image.
+    pose : (4, 4) from the readings, if computed.
+    beside : m by which the image contradicts the readings.
     """
 
     normals: Array
@@ -97,16 +100,23 @@ class _Sample:
 class VisualServo:
     """Controller of a calibrated machine by its legs in one camera, [B] III with the errata.
 
-    machine : with calibrated values. camera : required for images only. T_camera_base : (4, 4).
+    machine : with calibrated values.
+    camera : required for images only.
+    T_camera_base : (4, 4).
     goal : a platform pose (4, 4), edges (s, 2, 3) of the seen legs, or a :class:`GoalImage`.
-    law : "edges" or "directions". gain : 1/s; less than the inverse of the time between samples,
-    delay included. rate_limits : largest velocity of all motors, or (m,) of each. legs : (s,) seen
-    legs from 0, by default all with tubes. start : (4, 4) a pose near the machine's first pose, by
-    default its home; it selects the assembly mode. tolerance : m or rad of a reading, at the goal.
-    period : s between samples, to predict the end of a motor's range. edge_shift : px of an image,
-    as calibrated. binning : pixels that are averaged in each direction before edges are measured;
-    by default such that about 1024 remain along the longer side. Raises InputError for invalid
-    arguments.
+    law : "edges" or "directions".
+    gain : 1/s; less than the inverse of the time between samples, delay included.
+    rate_limits : largest velocity of all motors, or (m,) of each.
+    legs : (s,) seen legs from 0, by default all with tubes.
+    start : (4, 4) a pose near the machine's first pose, by default its home; it selects the
+        assembly mode.
+    tolerance : m or rad of a reading, at the goal.
+    period : s between samples, to predict the end of a motor's range.
+    edge_shift : px of an image, as calibrated.
+    binning : pixels that are averaged in each direction before edges are measured; by default such
+        that about 1024 remain along the longer side.
+
+    Raises InputError for invalid arguments.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
 """Machine in front of a camera, as a controller models it, and its legs at one moment.
 
 Visual servoing by the legs ([B] III) needs the points A_j and the rods' lengths, from the readings
-and the model, and the legs' measured directions. If every leg is seen and the platform is rigid,
-nothing else enters: B = A + length u, without the platform's geometry and without forward
-kinematics. Legs that are not seen, joint axes and articulated platforms need the pose from the
+and the model, and the legs' measured directions. If every leg is observed and the platform is
+rigid, that is sufficient: B = A + length u, without the platform's geometry and without forward
+kinematics. Legs that are not observed, joint axes and articulated platforms need the pose from the
 readings.
 
 A twist is (omega, tau) as in :mod:`pkmcal.geometry.rigid`, along the base frame's axes; tau is the
@@ -41,8 +41,10 @@ from pkmcal.mechanisms.kinematics import closure_at, forward
 class MachineView:
     """Controller's model of a machine and of the camera in front of it.
 
-    machine : its values may be (..., P), one machine for each run. T_camera_base : (..., 4, 4).
-    legs : (s,) seen legs, from 0. radius : (s,) m, of each leg's visible tube.
+    machine : its values may be (..., P), one machine for each run.
+    T_camera_base : (..., 4, 4).
+    legs : (s,) seen legs, from 0.
+    radius : (s,) m, of each leg's visible tube.
     """
 
     machine: Machine
@@ -125,10 +127,13 @@ def visible_tubes(machine: Machine, legs: Integers) -> Integers:
 class Legs:
     """All limbs at one moment, base frame, leading axes broadcast; L legs, E rows of closure.
 
-    a, b, u : (..., L, 3). length : (..., L). pivot : (..., 3) point of tau.
-    a_by_reading : (..., L, 3). b_by_pose : (..., L, 3, 6), b_by_internal : (..., L, 3, n).
+    a, b, u : (..., L, 3).
+    length : (..., L).
+    pivot : (..., 3) point of tau.
+    a_by_reading : (..., L, 3).
+    b_by_pose : (..., L, 3, 6), b_by_internal : (..., L, 3, n).
     rows : (..., E, 6), hinges : (..., E, n), drives : (..., E, m) derivatives of the closure by the
-    twist, the hinges and the readings.
+        twist, the hinges and the readings.
     """
 
     a: Array
@@ -161,9 +166,10 @@ def legs_from_image(
 ) -> Legs:
     """Limbs with measured directions; other quantities from the model and the readings.
 
-    u_camera : (..., s, 3) measured directions of the seen legs, camera frame. readings : (..., m).
+    u_camera : (..., s, 3) measured directions of the seen legs, camera frame.
+    readings : (..., m).
     near : (..., 4, 4) start of forward kinematics, where they are needed; by default the pose from
-    the seen legs, or home. The pivot is the mean of the platform's joints.
+        the seen legs, or home. The pivot is the mean of the platform's joints.
     """
     rot_t = view.T_camera_base[..., :3, :3].mT[..., None, :, :]
     u = (rot_t @ u_camera[..., None])[..., 0]

@@ -1,7 +1,7 @@
 """Simulated control: many runs in parallel, how each run ends, and the noise at the goal.
 
-The true machine stands in front of the true camera, :class:`pkmcal.control.image.Eye`; the
-controller has its own geometry, and its readings and edges are delayed and noisy.
+The true machine and the true camera are those of :class:`pkmcal.control.image.Eye`; the controller
+has its own geometry, and its readings and edges are delayed and noisy.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ AT_GOAL_NOISE_DEVIATIONS = 3.0
 """Distance from the goal, in standard deviations of the noise there, within which a platform has
 arrived."""
 TREMBLING_DISTANCE_SHARE = 0.1
-"""Distance from the goal, relative to the path's length, beyond which noise is no excuse."""
+"""Distance from the goal, relative to the path's length, above which a run has not arrived,
+whatever the noise."""
 AT_REST = 0.02
-"""Velocity, relative to the one that the error asks for, below which a run is at rest."""
+"""Velocity, relative to that of an exponential approach, below which a run is at rest."""
 AT_STOP = 1e-9
 """Distance, in m or rad, by which rounding may put a reading beyond its range."""
 NO_EDGE_NOISE = EdgeNoise(shift=0.0, tilt=0.0)
@@ -130,7 +131,9 @@ RUN_ENDS = tuple(End)
 class Stillness:
     """Noise of one image as a displacement of the platform, RMS over images for each goal.
 
-    joints : (R,) m, over the platform's joints. position : (R,) m, of their mean. turn : (R,) rad.
+    joints : (R,) m, of the platform's joints.
+    position : (R,) m, of the mean of the joints.
+    turn : (R,) rad.
     """
 
     joints: Array
@@ -195,10 +198,14 @@ def one_image(
 class LoopSettings:
     """Settings of a controller.
 
-    gain : 1/s. rate : samples per second. delay : samples from the exposure to the motors'
-    response. noise : of the edges, px. joint_noise : of a reading, m or rad. speed : (m,) largest
-    velocities of the motors, which are scaled together. duration : s. at : where the interaction
-    matrix is evaluated.
+    gain : 1/s.
+    rate : samples per second.
+    delay : samples from the exposure to the motors' response.
+    noise : of the edges, px.
+    joint_noise : of a reading, m or rad.
+    speed : (m,) largest velocities of the motors, which are scaled together.
+    duration : s.
+    at : where the interaction matrix is evaluated.
     """
 
     law: str = "edges"
@@ -221,10 +228,15 @@ class LoopSettings:
 class ServoRuns:
     """R runs of K samples.
 
-    time : (K,) s. error : (R, K) norm of e. travel : (R, K) RMS distance of the platform's joints
-    from the goal, m. past : (R, K) share of the path by which they are beyond the goal.
-    T_base_platform : (R, K, 4, 4). readings : (R, K, m). end : R ends. last : (R,) sample at which
-    a run was stopped; later samples repeat it. goals : (R, 4, 4).
+    time : (K,) s.
+    error : (R, K) norm of e.
+    travel : (R, K) RMS distance of the platform's joints from the goal, m.
+    past : (R, K) overshoot: distance beyond the goal, relative to the path.
+    T_base_platform : (R, K, 4, 4).
+    readings : (R, K, m).
+    end : R ends.
+    last : (R,) sample at which a run was stopped; later samples repeat it.
+    goals : (R, 4, 4).
     """
 
     time: Array
@@ -287,7 +299,8 @@ def simulate_servo_runs(
 class _Now:
     """State of all runs at one sample.
 
-    sign : (R,) of the start's assembly mode. end : (R,) index into ``RUN_ENDS``, -1 for running.
+    sign : (R,) of the start's assembly mode.
+    end : (R,) index into ``RUN_ENDS``, -1 for running.
     last : (R,) sample of the end.
     """
 
@@ -412,7 +425,7 @@ class _Record:
 def _floor(
     eye: Eye, goals: Array, readings: Array, loop: LoopSettings, rng: np.random.Generator
 ) -> Array:
-    """Distance (R,), in m, of the platform's joints from the goal that noise alone explains."""
+    """Distance (R,), in m, of the platform's joints from the goal that is due to noise alone."""
     still = one_image(eye, eye.true, loop.law, goals, readings, loop.noise, rng, draws=8)
     part = loop_factor(loop.gain / loop.rate, loop.delay)
     return np.nan_to_num(

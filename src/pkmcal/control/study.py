@@ -1,9 +1,9 @@
 """Study of visual servoing with different estimates of the geometry, [B] Fig. 10.
 
 Each estimate controls many runs of the simulated loop, and the visibility of the platform's motion
-is analysed. The estimates: E1, the nominal model fitted to the identified
-base centres ([B] eq. 15). E2, the identified geometry. E3, the nominal model with a hand-measured
-camera pose. The true geometry is the reference.
+is analysed. The estimates are E1, the nominal model fitted to the identified base centres ([B] eq.
+15); E2, the identified geometry; E3, the nominal model with a hand-measured camera pose. The true
+geometry is the reference.
 """
 
 from __future__ import annotations
@@ -146,8 +146,9 @@ def _placed_by_hand(
 class Plan:
     """Settings of a study.
 
-    runs : number for each estimate. hand_position, hand_rotation : errors of the hand-measured
-    camera pose, m and rad. start, goal : (4, 4) of every run; random by default.
+    runs : number for each estimate.
+    hand_position, hand_rotation : errors of the hand-measured camera pose, m and rad.
+    start, goal : (4, 4) of every run; random by default.
     """
 
     loop: LoopSettings = field(default_factory=LoopSettings)
@@ -163,9 +164,12 @@ class Plan:
 class Plant:
     """Machine and camera under control.
 
-    nominal : (P,) nominal values. uncertainty : of the calibration. legs : seen legs, from 0; by
-    default all with tubes. origin : a sentence for people. station : the camera's station, None
-    without a calibration. findings : findings on the source.
+    nominal : (P,) nominal values.
+    uncertainty : of the calibration.
+    legs : observed legs, from 0; by default all with tubes.
+    origin : source of the plant, a sentence for people.
+    station : the camera's station, None without a calibration.
+    findings : findings on the source.
     """
 
     machine: Machine
@@ -188,11 +192,12 @@ class Plant:
 class Trials:
     """Runs with one estimate of the geometry, and their figures.
 
-    overshoot : (R,) largest distance beyond the goal, relative to the path's length. rise : (R,)
-    largest rise of the norm of e above an earlier value, relative to its start. settling : (R,) s
-    after which the platform stays within ARRIVED_DISTANCE_SHARE of its path, NaN for never.
+    overshoot : (R,) largest distance beyond the goal, relative to the path's length.
+    rise : (R,) largest increase of the norm of e above an earlier value, relative to its start.
+    settling : (R,) s after which the platform stays within ARRIVED_DISTANCE_SHARE of its path, NaN
+        for never.
     astray : (R,) m, largest RMS distance of the platform's joints from the path with the true
-    geometry.
+        geometry.
     """
 
     estimate: Belief
@@ -217,9 +222,10 @@ class Trials:
 class Study:
     """Results of a study.
 
-    outcomes : true, identified, cad, hand. image, held : noise at the goals, of one image and in
-    the loop. hidden : (s,) share of starts and goals at which a leg stands behind another.
-    visibility : of the platform's motion by the observed legs.
+    outcomes : runs with the estimates true, identified, cad and hand.
+    image, held : noise at the goals, of one image and in the loop.
+    hidden : (s,) share of starts and goals at which a leg is behind another.
+    visibility : visibility of the platform's motion by the observed legs.
     """
 
     scene: Plant

@@ -2,8 +2,8 @@
 
 Each image has one measurement pass about the pose from the readings. The edges give the legs'
 lines, which the law needs, and correct the predicted pose for the next image. If the legs are not
-found there, one wide search follows; other assembly modes are tried once, while the machine stands
-still.
+detected there, one wide search follows; other assembly modes are tried once, while the machine is
+at rest.
 """
 
 from __future__ import annotations
@@ -56,12 +56,14 @@ SEARCH_ROUNDS = 3
 
 @dataclass(frozen=True)
 class LegLines:
-    """Seen legs as two edges each, of the radius that the controller uses; camera frame.
+    """Observed legs as two edges each, of the radius that the controller uses; camera frame.
 
-    normal : (L, 2, 3) unit, NaN where the leg was not found. basis : (L, 2, 3, 2) tangent bases,
-    shift first. joint : (L, 4, 4) covariance in these bases, rad^2, side 0 before side 1; the edges
-    are correlated, because the distance of a leg turns both against each other. agrees : (L,)
-    whether the edges fit one leg. valid : (L,) whether edges of both sides were measured and agree.
+    normal : (L, 2, 3) unit, NaN where the leg was not detected.
+    basis : (L, 2, 3, 2) tangent bases, shift first.
+    joint : (L, 4, 4) covariance in these bases, rad^2, side 0 before side 1. The edges are
+        correlated, because a change of the leg's distance rotates both in opposite directions.
+    agrees : (L,) whether the edges fit one leg.
+    valid : (L,) whether edges of both sides were measured and agree.
     """
 
     normal: Array
@@ -82,13 +84,15 @@ class LegLines:
 
 @dataclass(frozen=True)
 class EdgeMisfits:
-    """Misfits of an image's edges at the predicted pose; M edges of s seen legs.
+    """Misfits of an image's edges at the predicted pose; M edges of s observed legs.
 
-    leg : (M,) index of the edge's leg among the seen ones. misfit : (M, 2) rotation from the
-    predicted plane to the measured one, in the edge's basis. by_a, by_b : (M, 2, 3) derivatives of
-    the predicted plane by the leg's ends, camera frame. information : (M, 2, 2). side : (M,).
-    closure : of the machine at the predicted pose. a, b : (s, 3) ends of the seen legs, camera
-    frame.
+    leg : (M,) index of the edge's leg among the observed ones.
+    misfit : (M, 2) rotation from the predicted plane to the measured one, in the edge's basis.
+    by_a, by_b : (M, 2, 3) derivatives of the predicted plane by the leg's ends, camera frame.
+    information : (M, 2, 2).
+    side : (M,).
+    closure : closure of the machine at the predicted pose.
+    a, b : (s, 3) ends of the observed legs, camera frame.
     """
 
     leg: Integers
@@ -233,7 +237,7 @@ def corrected_pose(
     """Pose (4, 4) after one Gauss-Newton step on the edges of the valid legs (s,).
 
     The step is along the platform's motion. Edges with large misfits have small weights (Cauchy),
-    so that a leg taken for another does not pull the pose.
+    so that edges of another leg have little influence.
     """
     use = valid[rows.leg]
     if not use.any():
@@ -284,9 +288,11 @@ class Sight:
 class TrackState:
     """State of the tracker between two images.
 
-    T_base_platform : (4, 4) pose from the readings. correction : (6,) left perturbation from that
-    pose to the edges'. valid : (L,) seen legs that were found. blur : px, NaN before any leg was
-    found. searched : whether the last image needed a wide search.
+    T_base_platform : (4, 4) pose from the readings.
+    correction : (6,) left perturbation from that pose to the edges'.
+    valid : (L,) seen legs that were found.
+    blur : px, NaN before any leg was found.
+    searched : whether the last image needed a wide search.
     """
 
     T_base_platform: Array
@@ -298,12 +304,15 @@ class TrackState:
 
 @dataclass(frozen=True)
 class TrackedLegs:
-    """Seen legs in one image; L seen legs, camera frame.
+    """Observed legs in one image; L legs, camera frame.
 
-    lines : normals (L, 2, 3) with tangent bases and covariances, NaN where lost. valid : (L,).
-    reasons : (L,) why a leg is lost, "" otherwise. T_base_platform : (4, 4) pose from the edges,
-    near the pose from the readings. closed : False if no pose fits the readings. beside : m,
-    largest error of a rod's length at this pose, from late readings or those of another image.
+    lines : normals (L, 2, 3) with tangent bases and covariances, NaN where lost.
+    valid : (L,).
+    reasons : (L,) why a leg is lost, "" otherwise.
+    T_base_platform : (4, 4) pose from the edges, near the pose from the readings.
+    closed : False if no pose fits the readings.
+    beside : m, largest error of a rod's length at this pose, due to delayed readings or those of
+        another image.
     state : for the next image.
     """
 

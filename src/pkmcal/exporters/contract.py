@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from inspect import isabstract
@@ -25,6 +25,9 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError, ResultError, legible
 from pkmcal.exporters.samples import samples
 from pkmcal.files import check_own_folder, closest, write_folder
+from pkmcal.levels import MAJORITY
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.disturbances import compliance, growth_by_readings, sag, tool_shift
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.wording import listed
 
@@ -55,13 +58,22 @@ class Difference:
 class ExportedValue(NamedTuple):
     """Value of a file under the target program's own name, and its standard deviation.
 
-    unit : mm, degrees or steps. sigma : None for a machine without a covariance.
+    unit : mm, degrees or steps.
+    sigma : None for a machine without a covariance.
+    data_share : share of the information that comes from the data, 1 - posterior variance / prior
+        variance; None without a covariance, and for a value that the mechanism file fixes.
     """
 
     name: str
     value: float
     unit: str
     sigma: float | None = None
+    data_share: float | None = None
+
+    @property
+    def by_nominal(self) -> bool:
+        """Whether the nominal model decides the value more than the data do."""
+        return self.data_share is not None and self.data_share < MAJORITY
 
 
 class Exporter(ABC):
@@ -74,6 +86,8 @@ class Exporter(ABC):
         is not taken for the new one's.
     holds_screws : whether it has the screws that joints turn; other formats take readings to be
         lengths.
+    holds_effects : whether it has the sag under a load, the thermal growth, and universal joints
+        whose axes do not meet; it is the mechanism file.
     """
 
     name: ClassVar[str]
@@ -81,6 +95,7 @@ class Exporter(ABC):
     trial: ClassVar[str] = ""
     leaves: ClassVar[tuple[str, ...]] = ()
     holds_screws: ClassVar[bool] = False
+    holds_effects: ClassVar[bool] = False
 
     @abstractmethod
     def files(self, source: MachineSource) -> dict[str, str]:
@@ -161,11 +176,18 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
         )
     more: list[Finding] = []
     machine = source.machine
-    if len(machine.layout.screws) and not exporter.holds_screws:
+    if len(machine.layout.screws) and not (exporter.holds_screws or exporter.holds_effects):
         poses, joints = samples(machine)
         source = replace(source, machine=machine.with_screws_held())
         change = largest(source.machine.inverse(poses), joints)
         more.append(note("export.without_screws", program=name, largest=change))
+    if not exporter.holds_effects:
+        if len(machine.layout.offsets):
+            poses, joints = samples(machine)
+            source = replace(source, machine=source.machine.with_meeting_axes(poses))
+            change = largest(source.machine.inverse(poses), joints)
+            more.append(note("export.without_joint_offsets", program=name, largest=change))
+        more += _without_effects(machine, name)
     files = exporter.files(source)
     differences = tuple(exporter.check(files, source))
     for difference in differences:
@@ -179,6 +201,28 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
             )
     notes, values = (*more, *exporter.notes(source)), exporter.values(source)
     return Export(exporter, files, differences, notes, values)
+
+
+def _without_effects(machine: Machine, name: str) -> Iterator[Finding]:
+    """Notes on sag and thermal growth, with what they do to the tool, at the compared poses."""
+    sags, growth = compliance(machine) is not None, machine.document.growth
+    if not sags and growth is None:
+        return
+    poses, joints = samples(machine)
+    if sags:
+        sunk = np.linalg.norm(tool_shift(machine, poses, sag(machine, poses)), axis=-1)
+        yield note(
+            "export.without_sag", program=name, largest=largest(sunk), least=float(sunk.min())
+        )
+    if growth is not None:
+        by = growth_by_readings(machine, joints, poses) @ np.array([growth.drives, growth.frame])
+        moved = np.linalg.norm(tool_shift(machine, poses, by), axis=-1)
+        yield note(
+            "export.without_growth",
+            program=name,
+            temperature=growth.temperature,
+            per_kelvin=largest(moved),
+        )
 
 
 def write_export(made: Export, folder: Path) -> None:

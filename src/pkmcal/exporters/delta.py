@@ -67,6 +67,8 @@ SWITCH_ROUNDING = 1e-3
 Values are written to 0.1 µm, and the height depends weakly on the angle of an arm that is nearly
 upright.
 """
+UNPLACED_BED_SIGMA = 1.0
+"""Prior sigma of the bed's height, m: far more than any data leave."""
 STEPS_ROUNDING = 1e-4
 """Tolerance of motor steps per mm."""
 VALUE_STEP = 1e-3
@@ -402,8 +404,9 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
 
 def value_sigmas(
     fit: Fit, freedoms: Freedoms, source: MachineSource, values: Callable[[Fit], Array]
-) -> Array | None:
-    """Standard deviations (k,) of a firmware's values; None for a machine without a covariance.
+) -> tuple[Array, Array] | None:
+    """Standard deviations (k,) of a firmware's values, by the calibration and by the nominal
+    model's prior sigmas alone; None for a machine without a covariance.
 
     The fit's parameters x minimise the tool's error r(x, theta) over the grid, so that ``dx = -J^+
     dr`` with J = dr/dx. A change of the machine, or of the bed's height, moves the tool at given
@@ -432,6 +435,7 @@ def value_sigmas(
     by_bed[:, 2] = -MM_A_METRE
     displaced = np.concatenate([by_machine, by_bed], axis=2).reshape(len(by_fit), -1)
     by_source = -np.linalg.lstsq(by_fit, displaced, rcond=None)[0]
+    by_values = _differences(lambda x: values(packed.fit(x)), packed.zeros) @ by_source
     # covariance of the parameters and the bed
     n = len(source.covariance)
     root = np.eye(n + 1, n)
@@ -439,8 +443,17 @@ def value_sigmas(
         root[n] = source.bed_by_parameters
     covariance = root @ source.covariance @ root.T
     covariance[n, n] += (source.bed_sigma or 0.0) ** 2
-    by_values = _differences(lambda x: values(packed.fit(x)), packed.zeros) @ by_source
-    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by_values, covariance, by_values), 0.0))
+    # prior of the same; nothing but the data places the bed
+    free = machine.parameters.free_matrix() * machine.parameters.tolerances_free()
+    prior = np.zeros((n + 1, n + 1))
+    prior[:n, :n] = free @ free.T
+    prior[n, n] = UNPLACED_BED_SIGMA**2
+    variances = (
+        np.einsum("ij,jk,ik->i", by_values, of_source, by_values)
+        for of_source in (covariance, prior)
+    )
+    posterior, nominal = (np.sqrt(np.maximum(variance, 0.0)) for variance in variances)
+    return posterior, nominal
 
 
 def _differences(function: Callable[[Array], Array], at: Array) -> Array:

@@ -31,6 +31,7 @@ class MechanismYaml(Exporter):
 
     name: ClassVar = "yaml"
     title: ClassVar = "pkmcal's own mechanism file"
+    holds_effects: ClassVar = True
 
     def files(self, source: MachineSource) -> dict[str, str]:
         """``mechanism.yaml`` with origin and sigmas of the values in a comment on top."""
@@ -54,6 +55,7 @@ class MachineJson(Exporter):
 
     name: ClassVar = "json"
     title: ClassVar = "names, values, units, deviations and covariance"
+    holds_effects: ClassVar = True
 
     def files(self, source: MachineSource) -> dict[str, str]:
         """``machine.json``."""

@@ -8,8 +8,9 @@ writing share the firmware's names, units, signs and formulas.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import ClassVar
 
@@ -42,7 +43,7 @@ from pkmcal.exporters.delta import (
     workspace_radius,
 )
 from pkmcal.files import closest, quoted, read_text
-from pkmcal.outcome.finding import Finding
+from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import listed
 
 CARRIAGE_STEP = 1 / 80
@@ -54,6 +55,10 @@ LARGEST_PRINTER_VALUE = 1e6
 """Bound on lengths (mm) and angles (degrees); larger values would overflow when squared."""
 TOWER_ANGLES = (210.0, 330.0, 90.0)
 """Usual directions of the towers X, Y and Z, degrees, counted anticlockwise."""
+LEAST_LIKENESS = 0.8
+"""Likeness, by difflib, of a misspelt key: two letters exchanged in five, or one wrong in five."""
+LEAST_PRIOR_SIGMA = 1e-4
+"""Prior sigma, mm, degrees or steps, below which a value is fixed: that of the written digits."""
 NUMBER = r"(-?\d+(?:\.\d+)?)"
 """Pattern of a number that a console prints."""
 
@@ -260,16 +265,22 @@ class Firmware(Exporter, ABC):
 
     def files(self, source: MachineSource) -> dict[str, str]:
         """The exported file; pins, speeds and the like remain the printer's own."""
-        text = self.text(self.fit(source), source)
+        values = self.values(source)
+        undetermined = [finding.text for finding in undetermined_values(values)]
         lines = [
-            f"{one.name} = {one.value:.4f} {one.unit}, sigma {one.sigma:.2g}"
-            if one.sigma
-            else f"{one.name} = {one.value:.4f} {one.unit}, exact"
-            for one in self.values(source)
+            f"{one.name} = {one.value:.4f} {one.unit},"
+            + (f" sigma {one.sigma:.2g}" if one.sigma else " exact")
+            + (", mostly by the nominal model" if one.by_nominal else "")
+            for one in values
             if one.sigma is not None
         ]
         head = ["Values and their standard deviations, before rounding:"] if lines else []
-        return {self.file: text + commented([*head, *lines], self.comment)}
+        text = self.text(self.fit(source), source)
+        return {
+            self.file: commented(undetermined, self.comment)
+            + text
+            + commented([*head, *lines], self.comment)
+        }
 
     def values(self, source: MachineSource) -> tuple[ExportedValue, ...]:
         """The firmware's values, with the standard deviations that the calibration gives them."""
@@ -283,7 +294,13 @@ class Firmware(Exporter, ABC):
         if sigmas is None:
             return values
         return tuple(
-            one._replace(sigma=sigma) for one, sigma in zip(values, sigmas.tolist(), strict=True)
+            one._replace(
+                sigma=sigma,
+                data_share=max(0.0, 1 - (sigma / prior) ** 2)
+                if prior > LEAST_PRIOR_SIGMA
+                else None,
+            )
+            for one, sigma, prior in zip(values, *map(np.ndarray.tolist, sigmas), strict=True)
         )
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
@@ -323,8 +340,22 @@ class Firmware(Exporter, ABC):
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """Agreement of settings and machine, and the steps after installing them."""
-        return (self.fit(source).following, *redo(source))
+        """Values that the data left to the nominal model, agreement of settings and machine, and
+        the steps after installing them.
+        """
+        undetermined = undetermined_values(self.values(source))
+        return (*undetermined, self.fit(source).following, *redo(source))
+
+
+def undetermined_values(values: Sequence[ExportedValue]) -> tuple[Finding, ...]:
+    """Warning with the names of values that the nominal model decides more than the data do; none
+    without such values.
+    """
+    names = [one.name for one in values if one.by_nominal]
+    if not names:
+        return ()
+    share = max(one.data_share or 0.0 for one in values if one.by_nominal)
+    return (doubtful("export.by_nominal", names=names, data_share=share),)
 
 
 def firmwares() -> list[Firmware]:
@@ -445,6 +476,51 @@ def reachable_carriages(points: Array, printer: Printer, label: str) -> Array:
             expected="the tool's own places, in mm, of the printer described in " + printer.label,
         )
     return carriages
+
+
+def misspelt_keys(names: Mapping[str, str], legal: Collection[str]) -> dict[str, str]:
+    """Names in a file that most likely mean one of a firmware's keys, as ``'delta_raduis' in line
+    7``, by that key; keys that the file has are not meant.
+
+    names : place by name, of all in the file or in a section of it. legal : the keys that are read.
+    """
+    absent = {key.lower(): key for key in legal if key not in names}
+    out: dict[str, str] = {}
+    for name, place in names.items():
+        if name not in legal:
+            near = get_close_matches(name.lower(), absent, n=1, cutoff=LEAST_LIKENESS)
+            out.update({absent[key]: f"{quoted(name)} in {place}" for key in near})
+    return out
+
+
+def misspelt_remarks(names: Mapping[str, str], legal: Collection[str]) -> tuple[str, ...]:
+    """Sentence for each misspelt key; arguments as for :func:`misspelt_keys`."""
+    return tuple(
+        f"{found} is not read: did you mean {key}?"
+        for key, found in misspelt_keys(names, legal).items()
+    )
+
+
+def missing_value(
+    name: str,
+    where: str,
+    expected: str,
+    names: Mapping[str, str],
+    legal: Collection[str],
+    next_step: str | None = None,
+) -> InputError:
+    """Error for a missing value of a printer, with the misspelt key that the file has instead.
+
+    names, legal : as for :func:`misspelt_keys`.
+    """  # fmt: skip
+    instead = misspelt_keys(names, legal).get(name)
+    return InputError(
+        f"this value of the printer is missing: {name}",
+        where=where,
+        found=instead,
+        expected=expected,
+        next_step=next_step if instead is None else f"Did you mean {name}? Correct the name",
+    )
 
 
 def means_by_position(points: Array) -> Array:

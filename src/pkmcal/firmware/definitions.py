@@ -10,7 +10,7 @@ import ast
 import math
 import operator
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import quoted
-from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE
+from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, missing_value
 
 LONGEST_EXPRESSION = 200
 """Bound on the characters of a value or a condition."""
@@ -151,10 +151,11 @@ class Definitions:
     """Definitions of a header.
 
     by_name : all that may hold, in the order of the file. label : the file's name, for messages.
+    legal : the names that are read.
     """
 
-    def __init__(self, text: str, label: str) -> None:
-        self.label = label
+    def __init__(self, text: str, label: str, legal: Collection[str] = ()) -> None:
+        self.label, self.legal = label, legal
         self.by_name: dict[str, list[Define]] = {}
         for define in active_definitions(text):
             self.by_name.setdefault(define.name, []).append(define)
@@ -163,6 +164,11 @@ class Definitions:
     def place(self, name: str) -> str:
         """The line of a definition, for messages."""
         return f"{self.label}, line {self.by_name[name][-1].line}"
+
+    @property
+    def places(self) -> dict[str, str]:
+        """Lines of all definitions, by name."""
+        return {name: f"line {found[-1].line}" for name, found in self.by_name.items()}
 
     def numbers(self, name: str, size: int, *default: float) -> Array:
         """Numbers (size,) of a definition; further ones, of extruders, are not looked at.
@@ -187,10 +193,8 @@ class Definitions:
         """The definition of a name. Raises InputError for none, and for several that differ."""
         all_of_it = self.by_name.get(name, [])
         if not all_of_it:
-            raise InputError(
-                f"this value of the printer is missing: {name}",
-                where=self.label,
-                expected=f"#define {name} with a number",
+            raise missing_value(
+                name, self.label, f"#define {name} with a number", self.places, self.legal
             )
         other = next((d for d in all_of_it if d.value != all_of_it[0].value), None)
         if other is not None:

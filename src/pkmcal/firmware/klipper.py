@@ -222,8 +222,7 @@ class Klipper(Firmware):
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """As for any firmware, and how SAVE_CONFIG's lines are kept."""
-        following, *others = super().notes(source)
-        return (following, note("export.klipper_saved"), *others)
+        return (*super().notes(source), note("export.klipper_saved"))
 
 
 # Klipper's formulas

@@ -23,14 +23,23 @@ from dataclasses import dataclass, field
 from glob import glob, has_magic
 from math import prod
 from pathlib import Path, PurePath
+from string import ascii_lowercase
 
 import numpy as np
 
 from pkmcal.arrays import short_repr
 from pkmcal.errors import InputError, legible
 from pkmcal.files import LARGEST_WRITTEN_FILE, quoted, read_text
-from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE
+from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, missing_value, misspelt_remarks
 
+KEYS = (
+    "kinematics", "delta_radius", "print_radius", "shoulder_radius", "shoulder_height",
+    "minimum_z_position", "arm_length", "upper_arm_length", "lower_arm_length", "angle",
+    "position_endstop", "rotation_distance", "microsteps", "full_steps_per_rotation", "gear_ratio",
+    "step_distance", "anchor_x", "anchor_y", "anchor_z",
+)  # fmt: skip
+"""Names of values that are read of [printer] and of the steppers."""
+SECTIONS = ("[printer]", *(f"[stepper_{letter}]" for letter in ascii_lowercase))
 SAVED_LINE_MARK = "#*#"
 FULL_STEPS = 200.0
 """Default full steps per motor revolution, as in Klipper."""
@@ -71,10 +80,15 @@ class KlipperConfig:
         if name not in self.entries.get(section, {}):
             if default is not None:
                 return default
-            raise InputError(
-                f"this value of the printer is missing: {name}",
-                where=f"{self.label}, [{section}]",
-                expected=f"{name}: a number",
+            whole = section in self.entries
+            raise missing_value(
+                name if whole else f"[{section}]",
+                f"{self.label}, [{section}]" if whole else self.label,
+                f"{name}: a number" if whole else f"[{section}] with {name}",
+                self._places(section)
+                if whole
+                else {f"[{one}]": self.label for one in self.entries},
+                KEYS if whole else SECTIONS,
                 next_step=None
                 if not self.missing
                 else f"Put {self.missing[0][0]}, which {self.missing[0][1]} includes, beside"
@@ -93,6 +107,10 @@ class KlipperConfig:
                 expected="a number in mm, or degrees",
             )
         return value
+
+    def _places(self, section: str) -> dict[str, str]:
+        """Places of a section's entries by name."""
+        return {name: place for name, (_, place) in self.entries.get(section, {}).items()}
 
     def positive(self, section: str, name: str, default: float | None = None) -> float:
         """Number in a section that must be positive. Raises InputError otherwise."""
@@ -148,11 +166,14 @@ class KlipperConfig:
         return turn / (full * micro * prod(a / b for a, b in pairs))
 
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on included files that are missing, and on step_distance."""
+        """Sentences on included files that are missing, misspelt names, and step_distance."""
         out = [
             f"{place} includes {spec}, which is not there; values in it are not read."
             for spec, place in self.missing
         ]
+        for section in self.entries:
+            if section == "printer" or section.startswith("stepper_"):
+                out += misspelt_remarks(self._places(section), KEYS)
         old = self.entries.get("stepper_a", {})
         if "step_distance" in old and "rotation_distance" not in old:
             distance = self.positive("stepper_a", "step_distance")

@@ -31,6 +31,8 @@ ARM_MARGIN_BELOW = 5.0
 STEEPEST_ARM = 90.0
 SHORTEST_CABLE = 1.0
 """Shortest length of a cable at home, mm."""
+SHORTEST_WINCH = 50.0
+"""Bound below which a winch's longest cable at home, mm, shows anchors in metres."""
 UP = np.array([0.0, 0.0, 1.0])
 OTHER_KINEMATICS: Mapping[str, str] = {
     "delta": "a linear delta is read with --printer FILE",
@@ -148,6 +150,16 @@ def _winch(config: KlipperConfig) -> NominalModel:
     anchors = np.array([
         [config.number(name, f"anchor_{c}") for c in "xyz"] for name in (*names[:3], *more)
     ])  # fmt: skip
+    lengths = np.linalg.norm(anchors, axis=1)
+    if SHORTEST_CABLE <= lengths.max() < SHORTEST_WINCH:
+        raise InputError(
+            "the anchors are too near to the origin for a winch",
+            where=f"{config.label}, [stepper_a]",
+            found=f"{lengths.max():.4g} mm at most",
+            expected=f"{SHORTEST_WINCH:g} mm or more: Klipper's anchor_x, anchor_y and anchor_z are"
+            " in mm",
+            next_step="If these are metres, multiply them by 1000",
+        )
     for name, anchor in zip(names, anchors, strict=False):
         if np.linalg.norm(anchor) < SHORTEST_CABLE:
             raise InputError(

@@ -50,6 +50,7 @@ from pkmcal.firmware.contract import (
     Printer,
     Touches,
     WrittenValues,
+    misspelt_remarks,
 )
 from pkmcal.firmware.definitions import Definitions
 from pkmcal.firmware.marlin_probing import marlin_touches
@@ -87,6 +88,14 @@ BED_PROBES = {
 }  # fmt: skip
 """Definitions of which a printer with a probe has one; NOZZLE_TO_PROBE_OFFSET stands without."""
 
+PRINT_RADII = ("DELTA_PRINTABLE_RADIUS", "PRINTABLE_RADIUS")
+"""Older and newer name of the print radius."""
+DEFINES = (
+    "DELTA_DIAGONAL_ROD", "DELTA_RADIUS", "DELTA_HEIGHT", "DELTA_ENDSTOP_ADJ",
+    "DELTA_TOWER_ANGLE_TRIM", "DELTA_DIAGONAL_ROD_TRIM_TOWER", "DELTA_RADIUS_TRIM_TOWER",
+    "NOZZLE_TO_PROBE_OFFSET", "DEFAULT_AXIS_STEPS_PER_UNIT", *PRINT_RADII,
+)  # fmt: skip
+"""Names of Configuration.h that are read."""
 MARLIN_COMMANDS = ("M665", "M666", "M92", "M851", "M206")
 _DELTA_HEADING = re.compile(r"echo:[\s;]*Delta settings|Delta settings: L[<=]", re.IGNORECASE)
 _PROGRAM = re.compile(r"FIRMWARE_NAME:\s*Marlin|echo:\s*Marlin|For Marlin\.", re.IGNORECASE)
@@ -316,7 +325,7 @@ def _small_offsets(offset: Array, steps: list[float]) -> tuple[str, ...]:
 def _configured(text: str, label: str) -> Settings:
     """Settings of Configuration.h. Raises InputError for missing or impossible values."""
     condition = next((one for one in text.splitlines() if _DELTA_CONDITION.match(one)), None)
-    values = Definitions(text, label)
+    values = Definitions(text, label, DEFINES)
     if condition is not None and "DELTA" not in values.by_name:
         raise InputError(
             "this configuration is not of a delta: its values are those of an example",
@@ -356,7 +365,7 @@ def _configured(text: str, label: str) -> Settings:
         steps = values.numbers(name, 3)
         if steps.min() <= 0:
             raise impossible(values.place(name), name, float(steps.min()), "above 0")
-    radii = [n for n in ("DELTA_PRINTABLE_RADIUS", "PRINTABLE_RADIUS") if n in values.by_name]
+    radii = [name for name in PRINT_RADII if name in values.by_name]
     own_steps = [math.nan] if steps is None else steps.tolist()
     rod_trims = values.numbers("DELTA_DIAGONAL_ROD_TRIM_TOWER", 3, *zeros)
     angle_trims = values.numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros)
@@ -370,7 +379,10 @@ def _configured(text: str, label: str) -> Settings:
         probe=(float(probe[0]), float(probe[1]), float(probe[2])),
         reach=positive(radii[0]) if radii else None,
         steps=steps,
-        remarks=_small_offsets(offset, own_steps),
+        remarks=(
+            *_small_offsets(offset, own_steps),
+            *misspelt_remarks(values.places, DEFINES),
+        ),
     )
 
 

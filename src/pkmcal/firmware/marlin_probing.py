@@ -7,14 +7,15 @@ feature/bedlevel/abl/bbl.cpp and module/probe.h.
   nozzle's height when the probe triggered plus the Z of M851. ``M48`` prints the standard
   deviation of the touches at one place.
 - ``M420 V`` prints the heights of a grid without its places: column k is at L + k (R - L) / (n - 1)
-  of the ``G29 L R F B`` that probed it, row k likewise from F to B. Points that the probe does not
-  reach are extrapolated from the others, without a mark. G29 refuses bounds whose four points on
-  the axes are out of reach, so a point is taken as probed where it is no farther from the middle,
-  and the nozzle no farther, than at one of these four.
-- ``G33 P3 V0`` probes the nozzle's places at a radius that it prints, towards the towers and
-  between them: x, xy, y, yz, z, zx at 210, 270, 330, 30, 90, 150 degrees. The value c is the mean
-  of three places at a tenth of that radius, where a bowl has a hundredth of its depth at the edge;
-  it is taken for the middle's. With P4 and more all values are means over parts of circles.
+  of the ``G29 L R F B`` (or ``G29 H``, a square) that probed it, row k likewise from F to B.
+  Points that the probe does not reach are extrapolated from the others, without a mark. G29
+  refuses bounds whose four points on the axes are out of reach, so a point is taken as probed where
+  it is no farther from the middle, and the nozzle no farther, than at one of these four.
+- ``G33 P3 V0`` probes the nozzle's places at a radius that it prints, or that of M665 B in versions
+  up to 2.0.5, towards the towers and between them: x, xy, y, yz, z, zx at 210, 270, 330, 30, 90,
+  150 degrees. The value c is the mean of three places at a tenth of that radius, where a bowl has a
+  hundredth of its depth at the edge; it is taken for the middle's. With P4 and more all values are
+  means over parts of circles.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ _PLACELESS = {
     "Bed Topography Report": "a map of heights without its places",
     "G33 Auto Calibrate": "the output of a G33 whose places or values in force it does not contain",
 }
-_G33_RADIUS = re.compile(rf"Checking\.\.\. AC at radius:\s*{NUMBER}")
+_G33_START = re.compile(rf"Checking\.\.\. AC(?: at radius:\s*{NUMBER})?")
 _G33_VALUE = re.compile(r"(?<![A-Za-z])(c|xy?|yz?|zx?):\s*([-+]?\d{1,4}\.\d{1,6})")
 
 
@@ -77,7 +78,8 @@ def marlin_touches(text: str, label: str, printer: Printer) -> Touches | None:
         where=label,
         found=quoted(heading),
         expected="lines such as 'Bed X: 50.00 Y: 0.00 Z: -0.01'; or, with the command itself in the"
-        " text, M420 V behind G29 L R F B, or G33 P3 V0 that prints its radius",
+        " text, M420 V behind G29 L R F B, or G33 P3 V0 that prints its radius or follows M665"
+        " with B",
         next_step="Probe with G29 V4, or with G30 X Y at each place, and save what it prints",
     )
 
@@ -117,6 +119,8 @@ def _grid_points(text: str, label: str, printer: Printer) -> Array | None:
     lines = text.splitlines()
     start = max((n for n, line in enumerate(lines) if GRID_HEADING in line), default=None)
     words = None if start is None else _last_command(text, "G29", start)
+    if words is not None and "H" in words:
+        words = _square(words["H"], printer)
     if start is None or words is None or not words.keys() >= set("LRFB"):
         return None
     rows: list[list[float]] = []
@@ -149,6 +153,19 @@ def _grid_points(text: str, label: str, printer: Printer) -> Array | None:
     return np.column_stack([grid[probed] - beside, z[probed]])
 
 
+def _square(size: float, printer: Printer) -> dict[str, float] | None:
+    """Bounds of a square grid by G29's H, in whole mm; None where Marlin may have made it smaller.
+
+    Marlin cuts the square at the probe's reach, which is the print radius less a margin. A square
+    whose corners are within the print radius is taken as whole.
+    """
+    whole = int(abs(size))
+    if size <= 0 or printer.reach is None or whole > np.sqrt(2) * printer.reach:
+        return None
+    low = -float(whole // 2)
+    return {"L": low, "R": low + whole, "F": low, "B": low + whole}
+
+
 def _grid_row(line: str, number: int) -> list[float]:
     """Heights behind the row's number, NaN for marks of points without; none for another line."""
     _, _, heights = f" {line} ".partition(f" {number} ")
@@ -158,13 +175,24 @@ def _grid_row(line: str, number: int) -> list[float]:
         return []
 
 
+def _calibration_radius(text: str, line: int) -> float:
+    """Radius, mm, of a G33 that does not print it, by the last M665 before; 0 without one.
+
+    Such versions, up to 2.0.5, probe at M665's B, which later ones have beside A and C as a rod's
+    trim.
+    """
+    words = _last_command(text, "M665", line) or {}
+    return 0.0 if words.keys() & set("AC") else words.get("B", 0.0)
+
+
 def _g33_points(text: str, label: str, printer: Printer) -> Array | None:
-    """Tool positions (7, 3) mm of the last G33 P3 V0 in the text that prints its radius, or None.
+    """Tool positions (7, 3) mm of the last G33 P3 V0 in the text, or None where its radius is
+    neither printed nor that of an M665 before it.
 
     Without V0 the printer's values change between the printed heights.
     """
     lines = text.splitlines()
-    start = max((n for n, line in enumerate(lines) if _G33_RADIUS.search(line)), default=None)
+    start = max((n for n, line in enumerate(lines) if _G33_START.search(line)), default=None)
     if start is None or DRY_RUN not in lines[start]:
         return None
     words = _last_command(text, "G33", start)
@@ -175,8 +203,8 @@ def _g33_points(text: str, label: str, printer: Printer) -> Array | None:
         if "DRY-RUN" in line:
             break
         values.update({name: float(value) for name, value in _G33_VALUE.findall(line)})
-    match = _G33_RADIUS.search(lines[start])
-    radius = float(match[1]) if match else 0.0
+    match = _G33_START.search(lines[start])
+    radius = float(match[1]) if match and match[1] else _calibration_radius(text, start)
     if values.keys() != {"c", *G33_DIRECTIONS} or not 0 < radius < LARGEST_PRINTER_VALUE:
         return None
     angles = np.deg2rad(list(G33_DIRECTIONS.values()))

@@ -44,9 +44,8 @@ def read_measured(
             "there is no point of a bed in this file",
             where=label,
             expected="Klipper's lines 'probe at X,Y is z=Z', Marlin's 'Bed X: X Y: Y Z: Z',"
-            " RepRapFirmware's heightmap.csv or 'bed probe heights:' with the lines"
-            " G30 P0 X Y Z-99999, or a table"
-            " configuration,x [mm],y [mm],z [mm]",
+            " Smoothieware's G29.1, RepRapFirmware's heightmap.csv or 'bed probe heights:' with the"
+            " lines G30 P0 X Y Z-99999, or a table configuration,x [mm],y [mm],z [mm]",
         )
     return touches, distances
 

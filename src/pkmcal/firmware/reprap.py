@@ -281,6 +281,22 @@ def reprap_arm_angles(words: dict[str, Array], points: Array) -> Array:
 # Reading
 
 
+def _check_numbers(line: str, where: str) -> None:
+    """Raise InputError for a line with an expression, which the firmware evaluates as it runs."""
+    code = line.partition(";")[0].strip()
+    if "{" in code:
+        command = code.split()[0]
+        raise InputError(
+            f"{command} has an expression in braces, whose value only the printer knows",
+            where=where,
+            found=quoted(code),
+            expected="numbers",
+            next_step=f"Send {command} without values to the printer, which answers with those in"
+            " force, and write these numbers into a copy of this line; or name config-override.g,"
+            " which M500 writes",
+        )
+
+
 def _checked_words(
     text: str, label: str, override: Path
 ) -> tuple[dict[str, Array], dict[str, str], tuple[str, ...]]:
@@ -308,6 +324,7 @@ def _checked_words(
                     " for its values count.",
                 )
             continue
+        _check_numbers(line, f"{label}, line {n}")
         try:
             value = read_words(line)
         except ValueError:
@@ -337,6 +354,7 @@ def _steps_per_mm(text: str, label: str) -> Array | None:
             steps = None
         if not line.startswith("M92 "):
             continue
+        _check_numbers(line, f"{label}, line {n}")
         try:
             words = read_words(line)
         except ValueError:

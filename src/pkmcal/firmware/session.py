@@ -26,6 +26,9 @@ from pkmcal.starter import (
 )
 from pkmcal.wording import count
 
+LARGEST_BED_OFFSET = 3.0
+"""Distance, mm, of the bed from the firmware's Z 0 above which a remark reports it: a printer that
+was levelled with paper, or by its probe, is within a fraction of a millimetre."""
 CARRIAGE_MARGIN_BELOW = 5.0
 """Margin below the lowest carriage position that the bed's edge needs, mm.
 
@@ -179,10 +182,10 @@ def printer_session_texts(
             printed = measured or printed
         if part is not None:
             printed = read_part(part, delta)
-        texts = heights_texts(delta, _checked_touches(delta, touches), printed)
-    else:
-        texts = carried_texts(delta, places)
-    return texts, delta.remarks
+        touches = _checked_touches(delta, touches)
+        texts = heights_texts(delta, touches, printed)
+        return texts, (*delta.remarks, *_bed_remarks(delta, touches))
+    return carried_texts(delta, places), delta.remarks
 
 
 def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
@@ -262,6 +265,25 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
                 expected=f"points that belong to the values in {printer.label}",
             )
     return touches
+
+
+def _bed_remarks(printer: Printer, touches: Touches) -> tuple[str, ...]:
+    """Sentence on a bed that is far from the firmware's Z 0, as by a wrong offset of the probe."""
+    document = parse_yaml(nominal_text(printer, touches.carriages), Path("mechanism.yaml"))
+    machine = checked_machine(validated_document(document, MechanismDocument), document)
+    z = 1e3 * machine.forward(1e-3 * touches.carriages)[:, 2, 3] - touches.heights
+    off = float(np.mean(z))
+    if not abs(off) > LARGEST_BED_OFFSET:
+        return ()
+    probe = printer.offset[2]
+    offset = (
+        f" (the probe's offset is {_mm(probe)} mm in Z)" if probe and np.isfinite(probe) else ""
+    )
+    return (
+        f"By the values in {legible(printer.label)} the bed is at Z {_mm(off)} mm, not 0{offset}:"
+        " check the probe's offset and that these values were in force. The exported height at home"
+        " takes up this difference, so begin with the nozzle high.",
+    )
 
 
 def heights_texts(

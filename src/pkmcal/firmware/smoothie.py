@@ -7,6 +7,8 @@ circle of radius R, plus A, B and C, which are 0 here. Z of M665 and of M206 tog
 nozzle's height at home. A carriage is at ``height + sqrt(rod^2 - R^2) - trim`` where its switch
 triggers; its trim is that of M666, negative downwards.
 
+``G29.1`` of DeltaCalibrationStrategy.cpp prints the nozzle's positions at contact, seven places.
+
 The file config has the same as arm_length, arm1_trim, arm_radius, delta_tower1_offset,
 delta_tower1_angle, gamma_max, alpha_trim, beta_trim, gamma_trim and alpha_steps_per_mm.
 """
@@ -14,8 +16,10 @@ delta_tower1_angle, gamma_max, alpha_trim, beta_trim, gamma_trim and alpha_steps
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import ClassVar, final
 
 import numpy as np
@@ -31,7 +35,12 @@ from pkmcal.firmware.contract import (
     TOWER_ANGLES,
     Firmware,
     Printer,
+    Touches,
     WrittenValues,
+    means_by_position,
+    missing_value,
+    misspelt_remarks,
+    touches_at,
 )
 from pkmcal.firmware.towers import (
     SettingNames,
@@ -66,7 +75,12 @@ CONFIG_WORDS = {
     },
 }
 """Words of commands by keys of the file config."""
+OWN_KEYS = ("arm_length", "arm_radius")
+EMPTY: Mapping[str, str] = MappingProxyType(dict[str, str]())
 _HEADING = re.compile(r";\s*(Optional arm solution specific settings|Max Z\s*$)", re.MULTILINE)
+PROBING = "initial Bed ht is"
+"""Beginning of the output of G29 and G29.1 of the delta's calibration."""
+_PROBED = re.compile(r"\bX(-?\d{1,5}\.\d{4}) Y(-?\d{1,5}\.\d{4}) Z(-?\d{1,5}\.\d{4})(?!\S)")
 _CONFIG_LINE = re.compile(r"([a-z][a-z0-9_.]*)\s+([^\s=:]\S*)")
 """Key and value; with = or : between, the line is of another program, such as Klipper."""
 
@@ -85,7 +99,7 @@ class Smoothie(Firmware):
     def evidence(self, text: str, label: str) -> tuple[str, ...]:
         """Headings of M503, letters of its M665, and keys of config."""
         del label
-        key = next((line for line in _config(text) if line[1] == "arm_length"), None)
+        key = next((line for line in _config(text) if line[1] in OWN_KEYS), None)
         reasons = [] if key is None else [f"line {key[0]} has {key[1]}"]
         geometry = [command for command in commands(text, ("M665",)) if ":" not in command.rest]
         if geometry and (match := _HEADING.search(text)):
@@ -105,7 +119,29 @@ class Smoothie(Firmware):
         """
         label = path.name
         words = {**_config_words(text, label), **read_commands(text, label, SMOOTHIE_COMMANDS)}
-        return _settings(words, label).printer(self, label)
+        names = {key: f"line {n}" for n, key, _ in _config(text)}
+        settings = _settings(words, label, names)
+        # commands have no names that could be misspelt
+        remarks = misspelt_remarks(names, CONFIG_WORDS) if names.keys() & CONFIG_WORDS else ()
+        return replace(settings, remarks=remarks).printer(self, label)
+
+    def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
+        """Points of G29.1: the nozzle's positions at contact. Repeats at a place are averaged.
+
+        Raises InputError for the points of G29, whose heights begin at an unknown one.
+        """
+        if PROBING not in text:
+            return None
+        points = np.array(_PROBED.findall(text), dtype=float)
+        if len(points):
+            return touches_at(means_by_position(points), 0.0, printer, path.name)
+        raise InputError(
+            "these points of G29 have no heights, only how far the probe moved",
+            where=path.name,
+            found=PROBING,
+            expected="lines such as 'X-86.6000 Y-50.0000 Z0.1234'",
+            next_step="Probe with G29.1, which prints them",
+        )
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header of comments."""
@@ -154,9 +190,15 @@ class Smoothie(Firmware):
         return written_values(text, _settings(words, self.file))
 
 
-def _settings(words: Words, label: str) -> Settings:
-    """Settings of commands. Raises InputError for missing or impossible values."""
+def _settings(words: Words, label: str, names: Mapping[str, str] = EMPTY) -> Settings:
+    """Settings of commands. Raises InputError for missing or impossible values.
+
+    names : places of the keys of a file config.
+    """
     missing = [name for name in ("665L", "665R", "665Z") if name not in words]
+    if missing and names.keys() & CONFIG_WORDS:
+        key = next(key for key, word in CONFIG_WORDS.items() if word == missing[0])
+        raise missing_value(key, label, f"{key} with a number in mm", names, CONFIG_WORDS)
     if missing:
         raise InputError(
             f"M{missing[0][:-1]} has no value {missing[0][-1]}",
@@ -189,10 +231,10 @@ def _settings(words: Words, label: str) -> Settings:
 
 
 def _config(text: str) -> Iterator[tuple[int, str, str]]:
-    """Number, key and value of each line of a file config with a key that is read."""
+    """Number, key and value of each line of a file config."""
     for n, line in enumerate(text.splitlines(), 1):
         match = _CONFIG_LINE.match(line.partition("#")[0].strip())
-        if match and match[1] in CONFIG_WORDS:
+        if match:
             yield n, match[1], match[2]
 
 
@@ -200,6 +242,8 @@ def _config_words(text: str, label: str) -> Words:
     """Words of a file config. Raises InputError for values that are no numbers within bounds."""
     out: Words = {}
     for n, key, value in _config(text):
+        if key not in CONFIG_WORDS:
+            continue
         try:
             number = float(value)
         except ValueError:

@@ -32,12 +32,12 @@ printer's bed."""
 
 @dataclass(frozen=True)
 class Assembled:
-    """A problem and the origin of its rows.
+    """A least-squares problem and the origin of its rows.
 
-    observed : (K,) configurations with at least one edge, link, or pose of a board on the platform,
-    or all without a station; only these are in the problem. places : positions of the measurements
-    of each kind among the observed configurations. priors : names of the kinds of the prior rows,
-    (c,): nominal, the code of an effect, mount, level or gauge.
+    observed : (K,) configurations in the problem: those with at least one edge, link, or pose of a
+        board on the platform, or all configurations of a session without stations.
+    places : positions of the measurements of each kind among the observed configurations.
+    priors : (c,) kind of each prior row: nominal, the code of an effect, mount, level or gauge.
     """
 
     problem: Problem
@@ -47,7 +47,7 @@ class Assembled:
     __repr__ = short_repr
 
     def trusting(self, weights: RowGroups[Array]) -> Problem:
-        """The problem with weights (N,) of its measurements; see
+        """Problem with the weights (N,) of its measurements of each kind; see
         :meth:`~pkmcal.identify.problem.Problem.weighted`.
         """
         placed = zip(self.places, weights, strict=True)
@@ -63,23 +63,31 @@ def assemble(
     shading: float | Array = SHADING_SIGMA,
     share: float = 1.0,
 ) -> Assembled:
-    """The joint problem of one session (B = 1), with every edge in its own block.
+    """Joint problem of one session (B = 1); each edge is a block of its own.
 
-    shading : px, standard deviation of the lines' shading, for all or for each (n,), from an
-    earlier estimate. share : of candidate configurations, the part that will be measured, by which
-    edges that share their shading are counted.
+    shading : px, standard deviation of the lines' shading from an earlier estimate, one for all or
+        (n,), one for each line.
+    share : share of the candidate configurations that will be measured. It scales the number of
+        neighbouring edges that share their shading (:class:`LineCells`).
+
+    Raises InputError if there is no measurement, or if readings and indices do not match the
+    machine.
     """
     _check(machine, measurements)
+    # configurations in the problem, and the effects that are unknowns
     observed = observed_configurations(measurements)
     columns = _unknown_columns(measurements)
     codes = Counter[str]()
     for column in columns:
         codes[column.code] += column.count
+    # positions of the measurements
     edges = _places(measurements.edges.configuration, observed, measurements.edges.leg)
-    # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
+    # A board on the base does not depend on the platform's pose: where its configuration is not in
+    # the problem, its rows join those of the previous one.
     one = np.zeros(len(measurements.poses), dtype=int)
     poses = _places(measurements.poses.configuration, observed, one)
     link_blocks, link_data = _links(measurements, observed)
+    # shared unknowns and their priors
     unknowns = Unknowns(
         n_free=machine.parameters.free_matrix().shape[1],
         n_stations=measurements.n_stations,
@@ -96,6 +104,7 @@ def assemble(
         on_platform=measurements.on_platform,
         level=measurements.level,
     )
+    # rows of each kind
     blocks, data = _edges(machine, measurements, columns, edges, observed, share)
     pose_blocks, pose_data = _poses(measurements, columns, poses)
     problem = Problem(
@@ -168,8 +177,10 @@ def _check(machine: Machine, measurements: Measurements) -> None:
 
 
 def _places(configuration: Integers, visible: Booleans, kind: Integers) -> Places:
-    """Positions of measurements: one row for each visible configuration, in which each kind (N,)
-    has the same number of consecutive positions.
+    """Positions of N measurements: a row for each visible configuration, in which each kind has the
+    same number of consecutive positions.
+
+    configuration, kind : (N,) of each measurement. visible : (K,) configurations in the problem.
     """
     row = np.maximum(np.cumsum(visible) - 1, 0)[configuration]
     kinds, number = np.unique(kind, return_inverse=True)
@@ -201,12 +212,15 @@ def _by_measurement(
     columns: Sequence[Column],
     parts: Sequence[tuple[Array | None, Integers | None, Integers | None]],
 ) -> tuple[Integers, Array]:
-    """Numbers (N, w) of the columns that move each of N measurements, -1 for none, and the
-    derivatives (N, d, w) by these; numbers_each : d. parts : each column's derivatives (n, d, k),
-    measurements (n,), and numbers (n, k) where these are not all of the column.
+    """Sparse derivatives of N measurements of d numbers by the columns' numbers.
 
-    The numbers do not depend on the derivatives: where these are zero, the number is an unknown
-    that the data do not determine, and keeps its place.
+    count, numbers_each : N and d.
+    parts : of each column its derivatives (n, d, k), the measurements (n,) that it affects, None
+        for all, and the numbers (n, k) of the column that each derivative belongs to, None for all.
+
+    Returns numbers (N, w), -1 for padding, and derivatives (N, d, w). The numbers do not depend on
+    the values of the derivatives: where these are zero, the number is an unknown that the data do
+    not determine, and keeps its position.
     """
     of, number, by = list[Integers](), list[Integers](), list[Array]()
     first = 0
@@ -232,7 +246,7 @@ def _by_measurement(
 
 
 def _readings(columns: Sequence[Column], visible: Booleans) -> ReadingColumns:
-    """The columns that change the readings."""
+    """Derivatives of the readings of visible configurations by the columns that change readings."""
     ends = np.cumsum([0, *(one.count for one in columns)]).tolist()
     parts = [(k, one.readings) for k, one in enumerate(columns) if one.readings is not None]
     number = [np.arange(*ends[k : k + 2]) for k, _ in parts]
@@ -250,16 +264,17 @@ def _edges(
     visible: Booleans,
     share: float,
 ) -> tuple[EdgeBlocks, EdgeData]:
-    """The edges at their positions, and the readings of the observed configurations."""
+    """Edges at their positions, with the readings of the observed configurations."""
     edges, (keys, line) = measurements.edges, lines(measurements)
     radius = machine.layout.radius_of(edges.leg, edges.tube)
     parts = [(one.edges, one.edge_rows, one.edge_numbers) for one in columns]
     column, by_columns = _by_measurement(len(edges), 2, columns, parts)
+    # noise of the edges by shading: neighbouring edges of a line share it
     side = np.unique(keys[:, [0, 1, 3]], axis=0, return_inverse=True)[1].reshape(-1)
     own, alone, crowded = np.zeros((3, len(edges)))
     cells = LineCells.of(edges.normal, line if len(line) else np.full(len(edges), -1), side)
     if len(line):
-        # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
+        # a line of a single edge has no shading unknown: it could not be separated from the noise
         alone = np.where(line < 0, SHADING_SIGMA, 0.0)
         crowded = 1 + share * (cells.n_effective - 1)
         own = np.hypot(edges.shading * np.sqrt(crowded), alone)
@@ -296,7 +311,7 @@ def _edges(
 def _poses(
     measurements: Measurements, columns: Sequence[Column], at: Places
 ) -> tuple[PoseBlocks, PoseData]:
-    """The poses at their positions."""
+    """Measured poses at their positions."""
     poses = measurements.poses
     parts = [(one.poses, one.pose_rows, None) for one in columns]
     column, by_columns = _by_measurement(len(poses), 6, columns, parts)
@@ -315,8 +330,8 @@ def _poses(
 
 
 def _links(measurements: Measurements, visible: Booleans) -> tuple[LinkBlocks, LinkData]:
-    """The links; each is among the rows of its second configuration."""
-    rows = np.cumsum(visible) - 1  # of each configuration among the seen ones
+    """Links at their positions; each is a row of its second configuration."""
+    rows = np.cumsum(visible) - 1  # of each configuration among the visible ones
     ends = [np.zeros((0, 2), dtype=int), *(one.configuration for one in measurements.links)]
     ends = np.concatenate(ends)
     linked = np.unique(ends)
@@ -342,20 +357,24 @@ def prior_rows(
     on_platform: Booleans,
     level: Booleans,
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """Prior rows (c, na) on the shared unknowns, their targets (c,) and kinds.
+    """Prior rows (c, na) on the shared unknowns, their targets (c,) and kinds (c,).
 
-    Without the nominal model's priors the frames are free, so the constraints of the gauge are
-    rows: they can be met exactly, hence fix the frames and affect nothing else. columns : the
-    effects, each with the square root of its prior covariance. on_platform : (M,) mounts. level :
-    (S,) stations that do not tilt against the base.
+    columns : effects, each with the square root of its prior covariance.
+    use_prior : whether the nominal model is a prior. Without it the frames have no information, so
+        the constraints of the gauge are added as rows. They can be satisfied exactly, hence define
+        the frames and change no other result.
+    on_platform : (M,) mounts on the platform.
+    level : (S,) stations whose tilt against the base is zero by definition.
 
-    The prior sigma of the position of a mount on the platform is the size of the machine. Where a
-    platform rotates about one axis, no measurement determines the height of the board along it, and
-    a tilt by a tenth of a degree would seem to, by metres.
+    The prior sigma of the position of a mount on the platform is the size of the machine. If a
+    platform rotates about one axis only, no measurement determines the height of the board along
+    the axis; without the prior, a tilt of a tenth of a degree would shift that height by metres.
     """
     table, u = machine.parameters, unknowns
     first, tolerance = table.first_of_free(), table.tolerances_free()
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
+    # unknowns with a prior; radii always have one, since edges alone determine a tube's radius only
+    # in units of its distance
     held = np.flatnonzero(radius | use_prior)
     moving = np.flatnonzero(on_platform)
     places = (u.mounts.start + 6 * moving[:, None] + [3, 4, 5]).ravel()
@@ -366,7 +385,7 @@ def prior_rows(
     kinds: list[str] = []
 
     def add(kind: str, where: Integers, root: Array, at: Array | None = None) -> None:
-        """Rows on the unknowns at ``where`` with the covariance root root^T about ``-at``."""
+        """Append rows on the unknowns at ``where``: covariance ``root root^T``, mean ``-at``."""
         part = np.zeros((len(where), u.count))
         inverse_root = np.diag(1 / root) if root.ndim == 1 else np.linalg.inv(root)
         part[:, where] = inverse_root
@@ -380,9 +399,11 @@ def prior_rows(
     for column, root in zip(columns, roots, strict=True):
         add(column.code, first_column + np.arange(column.count), root, column.at)
         first_column += column.count
+    # positions of mounts, tilts of level stations
     size = machine_size(machine) if len(places) else 1.0
     add("mount", places, np.full(len(places), size))
     add("level", tilts, np.full(len(tilts), LEVEL_SIGMA))
+    # without a nominal prior the gauge's constraints fix the frames
     if not use_prior and freedoms(machine).shape[1]:
         c = frame_rows(machine, gauge) @ table.free_matrix() / float(np.mean(tolerance[~radius]))
         rows.append(np.pad(c, ((0, 0), (0, u.count - u.n_free))))
@@ -401,7 +422,7 @@ def machine_size(machine: Machine) -> float:
 
 
 def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState:
-    """A state as a batch of one run, with its free parameters only."""
+    """Batch of one run from a state, with the free parameters only."""
     u = assembled.problem.unknowns
     columns = np.zeros((1, u.effects.stop - u.effects.start))
     for code, count in u.codes:
@@ -423,8 +444,10 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
 
 
 def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
-    """The first run of a batch as a state. Unobserved configurations keep the pose of ``start``;
-    the lines' shading is left out, for its unit changes from estimate to estimate.
+    """State from the first run of a batch.
+
+    Unobserved configurations keep the poses of ``start``. The lines' shading is omitted, because
+    its unit differs between estimates.
     """
     u = assembled.problem.unknowns
     parts = {code: u.of_code(code) for code, _ in u.codes if code != SHADING}

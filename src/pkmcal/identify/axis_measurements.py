@@ -24,8 +24,10 @@ from pkmcal.geometry.rigid import dot
 class AxisNoise:
     """Standard deviations of one measured axis, with the values of [A] Table 1 as defaults.
 
-    psi : direction in the image plane, rad. theta : direction towards the viewer, rad. x, z : the
-    axis's point with y = 0, camera frame, m. images : number of images that are averaged.
+    psi : direction in the image plane, rad.
+    theta : direction towards the viewer, rad.
+    x, z : the axis's point with y = 0, camera frame, m.
+    images : number of images that are averaged.
     """
 
     psi: float = float(np.radians(0.05))

@@ -1,11 +1,10 @@
-"""Accuracy over the bed of a machine calibrated by heights: flatness, and the little that they
-determine along x and y.
+"""Accuracy over the bed of a machine calibrated by heights: flatness, and position along x and y.
 
-Errors that a firmware cannot represent, such as towers that lean and motors that go further than
-commanded, are held by the mechanism file and bend the bed all the same. The standard deviations are
-therefore those of a wider model, in which every value with a tolerance is free and the bed is as
-uneven as estimated. The best values of that model are the errors of the estimated machine as far as
-the heights determine them, and its covariance contains the undetermined part.
+Errors that a firmware cannot represent, such as leaning towers and wrong scales of motors, are held
+fixed by the mechanism file, but still bend the bed. The standard deviations are therefore those of
+a wider model, in which every parameter with a tolerance is free and the bed is as uneven as
+estimated. Its estimate gives the errors of the calibrated machine as far as the heights determine
+them, and its covariance contains the undetermined part.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from pkmcal.solver.ranks import column_space
 POINTS_OVER_BED = 60
 """Points over the bed at which heights are evaluated, probed or not."""
 NOTICED_TOUCH_DEVIATIONS = 4.13
-"""Standard deviations by which a wrong height is off the prediction by the others to be detected:
-with a false alarm of one in a thousand, four of five wrong ones are (W. Baarda, A testing procedure
-for use in geodetic networks, 1968).
+"""Error of a height that is detected with a power of 80 % at a false-alarm level of 0.1 %, in
+standard deviations of its difference from the prediction by the others (W. Baarda, A testing
+procedure for use in geodetic networks, 1968).
 """
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 """Angle between consecutive points on a spiral that covers a disc evenly."""
@@ -41,17 +40,17 @@ GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 class Bed:
     """Accuracy of the platform over the disc around the probed points.
 
-    radius : of the disc, m.
+    radius : radius of the disc, m.
     sigma : standard deviation (m, root mean square over the disc) of the platform's height above
-        the bed, apart from the bed's own height and tilt, with the prior sigmas of held values.
-    by_drawing : the same by the nominal model's prior sigmas alone.
-    sideways : standard deviation of its position along the bed, apart from frames, m.
-    size : standard deviation of the scale along the bed, a share.
-    z : of the platform's origin, m, base frame, in the middle of the disc where the first table's
-        height is 0.
+        the bed, apart from the bed's height and tilt, with the prior sigmas of held parameters.
+    by_drawing : same as ``sigma``, from the nominal model's prior sigmas alone.
+    sideways : standard deviation of the platform's position along the bed, frames removed, m.
+    size : relative standard deviation of the scale along the bed.
+    z : height of the platform's origin, m, base frame, in the middle of the disc, where the first
+        table's height is 0.
     touches : number of heights.
-    unnoticed : m, as sigma: effect on the bed of one wrong height, the worst of them, that is just
-        not detected; None where any would not be detected.
+    unnoticed : m, root mean square over the disc: largest effect on the bed of one wrong height
+        that is just not detected; None where no error of a height would be detected.
     """
 
     radius: float
@@ -65,18 +64,20 @@ class Bed:
 
 
 def bed_by_parameters(estimate: Estimate) -> Array:
-    """Derivative (n, P) of the bed's shape by the parameters: for a change v of them ``norm(out @
-    v)`` is the change of the tool's height over the disc (m, root mean square), apart from the
-    bed's height and tilt.
+    """Derivative (n, P) of the bed's shape by the parameters.
+
+    For a change v of the parameters ``norm(out @ v)`` is the change of the tool's height over the
+    disc (m, root mean square), apart from the bed's height and tilt.
     """
     poses, _, height = _bent(estimate)
     return height / np.sqrt(len(poses))
 
 
 def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
-    """Poses (n, 4, 4) over the disc, and derivatives by the parameters there: of the platform's
-    position (n, 3, P), and of its height above the bed (n, P), apart from the bed's own height and
-    tilt.
+    """Poses over the disc (n, 4, 4) and derivatives by the parameters there.
+
+    The derivatives are those of the platform's position (n, 3, P), and of its height above the bed
+    (n, P), apart from the bed's height and tilt.
     """
     machine = estimate.machine
     poses = _over_the_disc(estimate.state.T_base_platform[estimate.configurations])
@@ -99,11 +100,13 @@ def bed_of(estimate: Estimate, uneven: Sequence[Column]) -> Bed:
     poses, by, height = _bent(estimate)
     xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)
     ones, zeros = np.ones(len(xy)), np.zeros(len(xy))
+    # position along the bed, without shifts and rotation of the frame; its scale
     along = by[:, :2].reshape(-1, by.shape[-1])
     shifts = np.stack([ones, zeros], axis=1).ravel(), np.stack([zeros, ones], axis=1).ravel()
     turn = np.stack([-xy[:, 1], xy[:, 0]], axis=1).ravel()
     along = _less(along, np.column_stack([*shifts, turn]))
     stretch = xy.ravel() @ along / np.sum(xy**2)
+    # heights of the tool and of the table in the middle
     middle, state = poses[0], estimate.state
     there = state.T_camera_base[0] @ middle @ state.T_mount[0]
     nominal = _nominal_root(machine, by)
@@ -140,16 +143,16 @@ def _over_the_disc(probed: Array) -> Array:
 
 
 def _less(rows: Array, span: Array) -> Array:
-    """Rows (n, P) without their projection on the columns of ``span`` (n, m)."""
+    """Rows (n, P) minus their projection on the columns of ``span`` (n, m)."""
     return rows - span @ np.linalg.lstsq(span, rows, rcond=None)[0]
 
 
 def _nominal_root(machine: Machine, by: Array) -> Array:
-    """R (P, m) with R R^T the prior covariance of the free parameters, and of those held ones whose
-    effect no free one has.
+    """Root R (P, m) of the prior covariance of the free parameters, and of held parameters with an
+    effect of their own.
 
-    A held one whose effect a free one has, as the lower end of a rod and the tower's position,
-    would count twice. by : (n, 3, P) derivative of the platform's position by the parameters.
+    A held parameter with the same effect as a free one (the lower end of a rod, the position of its
+    tower) would count twice and is omitted. by : (n, 3, P) derivative of the platform's position.
     """
     table = machine.parameters
     everything = machine_from_document(machine.document.model_copy(update={"fixed": ()})).parameters
@@ -163,11 +166,11 @@ def _nominal_root(machine: Machine, by: Array) -> Array:
 
 
 def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tuple[Array, Array]:
-    """Estimate of the parameters in the wider model: difference (P,) of its best values from the
-    estimate's, and a root (P, m) of their covariance.
+    """Estimate of the parameters in the wider model: difference (P,) to the estimate, and a root
+    (P, m) of the covariance.
 
-    nominal : R (P, m), prior of the parameters that vary.
-    uneven : columns of the bed.
+    nominal : (P, m) root of the prior covariance of the varying parameters.
+    uneven : columns of the bed's unevenness.
     """
     rows, remainder = _rows_beside(estimate, uneven)
     table = estimate.machine.parameters
@@ -186,11 +189,10 @@ def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tupl
 
 
 def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, Array]:
-    """Information of the heights on all parameters and on the l random effects, these in their
-    prior deviations: rows (r, P + l) and residuals (r,).
+    """Information of the heights on all P parameters and the l random effects.
 
-    Poses, the bed's pose and all other unknowns are eliminated; priors of the parameters are left
-    out.
+    Returns rows (r, P + l), by parameters in m and rad and by effects in their prior sigmas, and
+    residuals (r,). All other unknowns are marginalized; priors of the parameters are left out.
     """
     assembled, info = estimate.linearized
     problem, state = info.problem.opened(info.state)
@@ -214,8 +216,9 @@ def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, A
 
 
 def _unnoticed(estimate: Estimate, height: Array) -> float | None:
-    """Effect on the bed of one wrong height that is just not detected, ``Bed.unnoticed``; height :
-    (n, P).
+    """Effect on the bed of one wrong height that is just not detected (``Bed.unnoticed``).
+
+    height : (n, P) derivative of the height over the disc.
     """
     info = estimate.linearized.info
     problem, state = info.problem, info.state
@@ -225,7 +228,7 @@ def _unnoticed(estimate: Estimate, height: Array) -> float | None:
     inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=ROUNDING, hermitian=True)
     inverse /= scale[:, None] * scale
     own = rows[: len(rows) - len(problem.prior)]
-    # each configuration, its pose eliminated, has one number: the height there
+    # with its pose eliminated, each configuration has one reduced row: its height
     _, s, vt = np.linalg.svd(own.reshape(state.T_base_platform.shape[1], -1, own.shape[1]))
     felt = s[:, :1] * vt[:, 0]
     gain = felt @ inverse
@@ -239,7 +242,8 @@ def _unnoticed(estimate: Estimate, height: Array) -> float | None:
 
 
 def _deviation(rows: Array, off: Array, root: Array, places: int) -> float:
-    """Standard deviation of rows (n, P), root mean square over so many places, for parameters with
-    the offset ``off`` (P,) and the covariance root (P, m).
+    """Standard deviation of rows (n, P), root mean square over ``places`` points.
+
+    off, root : offset (P,) of the parameters, and root (P, m) of their covariance.
     """
     return float(np.sqrt((np.sum((rows @ off) ** 2) + np.sum((rows @ root) ** 2)) / places))

@@ -73,28 +73,28 @@ from pkmcal.solver.search import SEARCH, STEP_TOLERANCE, SearchOptions, Solution
 class BatchOptions:
     """Constants of the alternation of weights, noise and solution."""
 
-    # standard deviations, of all unknowns together, that a round's solution may still be off the
-    # optimum, mostly after two steps: far less than the effect of the next round's weights. Only
-    # after these have converged is it solved to the end
+    # tolerance of a round's solution: distance from the optimum in standard deviations of all
+    # unknowns together, usually reached in two steps. It is small beside the effect of the next
+    # round's weights; the last round is solved to STEP_TOLERANCE
     nearly_solved: float = 1e-3
     # largest number of rounds
     most_rounds: int = 30
-    # a round makes part of the step of the deviations of shading and edges; from this
-    # round on the step is extrapolated by this factor
+    # over-relaxation factor of the noise of shading and edges, whose fixed-point steps are too
+    # short, and the first round that uses it
     scatter_pace: float = 1.6
     first_paced_round: int = 2
-    # the same of the readings' noise, whose steps shrink geometrically, so that two of them give
-    # the factor; its upper bound
+    # upper bound of the over-relaxation factor of the readings' noise, which follows from the ratio
+    # of two consecutive steps
     furthest_noise_pace: float = 3.0
-    # rounds in which the tails of the edges' noise are chosen; they are discrete, and two that are
-    # equally likely could alternate for ever
+    # rounds in which the degrees of freedom of the edges' noise may change; they are discrete, and
+    # two equally likely values could alternate for ever
     free_rounds: int = 6
     # relative change of a noise scale below which it has converged
     scale_change: float = 1e-3
-    # part of the usual deviation of the lines' shading below which it is not estimated
+    # lower bound of the lines' shading, relative to its usual standard deviation
     least_shading_share: float = 0.1
-    # change of the deviations of the shading and of the edges' noise, relative to them and no less
-    # than to what is usual, below which they have converged
+    # change of the standard deviations of shading and edges below which they have converged,
+    # relative to the larger of the previous and the usual value
     shading_change: float = 0.02
     robust: RobustOptions = ROBUST
     edge_noise: EdgeNoiseOptions = EDGE_NOISE
@@ -105,7 +105,9 @@ class BatchOptions:
 
     @property
     def uncut_noise_log_step(self) -> float:
-        """Logarithm of a step of the readings' noise that was not cut short."""
+        """Logarithmic step of the readings' noise below which ``noise.largest_step`` did not limit
+        it.
+        """
         return 0.99 * float(np.log(self.noise.largest_step))
 
 
@@ -116,14 +118,14 @@ BATCH = BatchOptions()
 class BatchResult:
     """Joint estimate of B runs, with the estimated weights and noise.
 
-    solution : states, cost, stops; steps are those of all searches together.
+    solution : states, costs and stopping reasons; ``steps`` counts the steps of all rounds.
     weight : (B, K, G) robust weights 0..1 of each kind of measurement.
-    scale : (B,) factors on the stated noise of each kind; that of edges is from the annealing, and
-        one once their noise is estimated.
+    scale : (B,) factors on the stated noise of each kind; for edges the factor of the annealing,
+        and 1 once their noise is estimated.
     info : linearized problem at the solution, with these weights and this noise.
     edges : noise of the edges, as stated where it was not estimated.
-    irls_weight : (B, K, G) of each edge under that noise.
-    stated : (B or 1,) noise of the readings as stated.
+    irls_weight : (B, K, G) IRLS weight of each edge by that noise.
+    stated : (B or 1,) stated standard deviation of the readings.
     """
 
     solution: Solution
@@ -146,7 +148,7 @@ class BatchResult:
         return self.noise_of(READING_ROWS)
 
     def noise_of(self, kind: int) -> NoiseShares:
-        """Independent residuals of a kind of rows, which determine its noise."""
+        """Independent residuals of a kind of rows, for the restricted likelihood of its noise."""
         return noise_shares(self.info, kind, self.options.noise)
 
     @cached_property
@@ -183,9 +185,9 @@ def solve_batch(
     """Solve all runs of a problem from their starts; see :func:`bundle` for the options.
 
     scale_readings : with ``scale_noise``, estimate the readings' noise too. False where the machine
-        is held, because its changes would be taken for noise.
-    hopeless : return all runs as they are if, after a search, the poses' noise has to be larger
-        than stated by more than this factor.
+        is held, because the noise would absorb its changes.
+    hopeless : return all runs as they are if the poses' noise after a search exceeds the stated
+        noise by more than this factor.
     """
     n_runs = start.z.shape[0]
     ones: RowGroups[Array] = RowGroups(np.ones(n_runs), np.ones(n_runs), np.ones(n_runs))
@@ -197,11 +199,13 @@ def solve_batch(
     least = options.least_shading_share * problem.shading[:, :1]
     if scale_noise and n_lines:
         problem = problem.shaded(np.full((n_runs, n_lines), SHIFT_SIGMA))
+    # robust start: annealing, and least squares where it is cheaper
     state, weight, scale, steps = start, every, ones, np.zeros(n_runs, dtype=int)
     if robust:
         value = robust_start(problem, start, scaled=scale_noise, options=options.robust)
         state, weight, steps = value.state, value.weight, steps + value.steps
         scale = value.scale if scale_noise else ones
+    # first solution, with the stated noise of the edges; then weights, noise and solution in turns
     begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
     irls_weight, stated = np.ones_like(every.edges), problem.joint_noise
     solved = partial(_solved, options=options)
@@ -234,7 +238,7 @@ def _settle(
     hopeless: float,
     options: BatchOptions,
 ) -> BatchResult:
-    """Alternate weights, noise and solution until none of them changes.
+    """Alternate weights, noise and solution until they have converged.
 
     by_data : (B,) runs whose readings' noise is estimated instead of stated.
     least : lower bound of the lines' shading, px.
@@ -245,6 +249,7 @@ def _settle(
     for number in range(options.most_rounds):
         noise = _Noise.of(fit)
         if scale_noise:
+            # noise of poses and links, of the readings, and of edges and lines, by the residuals
             noise = noise.with_scales(fit)
             if noise.scale.poses.min() > hopeless:
                 return replace(fit, scale=noise.scale)
@@ -252,9 +257,11 @@ def _settle(
             noise = noise.with_edges(fit, by_tube, number, least, options)
         if by_data.any():
             noise = noise.with_readings(fit, np.where(by_data, np.exp(made), 1.0))
+        # weights by that noise
         weight, irls_weight = fit.weight, fit.irls_weight
         if robust:
             weight, irls_weight = _weights(fit, noise, by_tube)
+        # converged, or the next solution
         if noise.close_to(fit, by_tube, options) and _settled(
             noise.scale, fit.scale, weight, fit.weight, options.scale_change
         ):
@@ -281,10 +288,12 @@ def _settle(
 
 
 class _Noise(NamedTuple):
-    """Noise of the next round, by the residuals of a solution.
+    """Noise of the next round, from the residuals of a solution.
 
-    problem : of the solution, with the edges' new noise. scale : of poses and links. shading :
-    (B, lines) px. readings : standard deviations of the readings.
+    problem : that of the solution, with the new noise of the edges.
+    scale : (B,) factors on the stated noise of poses and links.
+    shading : (B, lines) px.
+    readings : (B,) standard deviations of the readings.
     """
 
     problem: Problem
@@ -300,7 +309,7 @@ class _Noise(NamedTuple):
         return cls(problem, fit.scale, fit.edges, problem.shading, problem.joint_noise)
 
     def with_scales(self, fit: BatchResult) -> _Noise:
-        """With the scales that the residuals of poses and links require."""
+        """Update the scales of poses and links from their residuals."""
         poses = _scale_of(fit, fit.scale.poses, POSE_ROWS)
         links = _scale_of(fit, fit.scale.links, LINK_ROWS)
         return self._replace(scale=RowGroups(np.ones_like(fit.scale.edges), poses, links))
@@ -308,8 +317,9 @@ class _Noise(NamedTuple):
     def with_edges(
         self, fit: BatchResult, by_tube: bool, number: int, least: Array, options: BatchOptions
     ) -> _Noise:
-        """With the noise and the shading that the residuals of edges require; from a certain round
-        on, shading changes by a part of that only.
+        """Update the noise and the shading of the edges from their residuals.
+
+        The shading is over-relaxed from round ``first_paced_round`` on.
         """
         edges = _edges(fit, by_tube, number, options)
         problem = replace(self.problem, data=edges.applied(self.problem.blocks, self.problem.data))
@@ -322,11 +332,11 @@ class _Noise(NamedTuple):
         return self._replace(problem=problem, edges=edges, shading=shading)
 
     def with_readings(self, fit: BatchResult, factor: Array) -> _Noise:
-        """With the readings' noise times a factor (B,)."""
+        """Multiply the readings' noise by a factor (B,)."""
         return self._replace(readings=self.problem.joint_noise_times(factor, fit.info.state))
 
     def close_to(self, fit: BatchResult, by_tube: bool, options: BatchOptions) -> bool:
-        """Whether the noise of edges, lines and readings is nearly that of a solution."""
+        """Whether the noise of edges, lines and readings has converged to that of a solution."""
         before = fit.info.problem
         change = (self.shading - before.shading) / np.maximum(before.shading, SHADING_SIGMA)
         most = options.shading_change if by_tube else options.scale_change
@@ -337,7 +347,7 @@ class _Noise(NamedTuple):
         )
 
     def applied(self, state: BatchState) -> tuple[Problem, BatchState]:
-        """The problem with this noise, and the state in its units of shading."""
+        """Problem with this noise, and the state with its shading in the new units."""
         problem = self.problem
         if not np.array_equal(self.shading, problem.shading):
             state = problem.with_shading_units(state, self.shading)
@@ -346,7 +356,9 @@ class _Noise(NamedTuple):
 
 
 def _weights(fit: BatchResult, noise: _Noise, by_tube: bool) -> tuple[RowGroups[Array], Array]:
-    """Weights by a solution's residuals and the noise, and those of the edges' IRLS."""
+    """Robust weights from a solution's residuals and the noise, and the IRLS weights of the
+    edges.
+    """
     problem, irls_weight = noise.problem, fit.irls_weight
     rows = problem.unweighted(fit.info.state)
     distance = norms(problem, rows)
@@ -360,15 +372,17 @@ def _weights(fit: BatchResult, noise: _Noise, by_tube: bool) -> tuple[RowGroups[
 def _readings_step(
     fit: BatchResult, by_data: Booleans, before: Array, made: Array, options: BatchOptions
 ) -> tuple[Array, Array]:
-    """Logarithmic step (B,) of the readings' noise that the data require, and the step to make.
+    """Logarithmic steps (B,) of the readings' noise: the step that the residuals require, and the
+    step to take.
 
-    The latter is extrapolated by the secant through this and the previous required step, so that no
-    further step should be required. Unchanged where no run's readings' noise is estimated.
+    The step to take is extrapolated by the secant through this required step and the previous one
+    (``before``, after the step ``made``), to the point where no further step is required. Both are
+    unchanged where no run's readings' noise is estimated.
     """
     if not by_data.any():
         return before, made
     log_factor = np.log(fit.reading_noise.factor())
-    # a step that was cut short is not all that is missing
+    # a step that was limited does not show the whole remaining change, so it gives no secant
     shrinks = (
         (log_factor * before > 0)
         & (np.abs(log_factor) < np.abs(before))
@@ -385,7 +399,9 @@ def _settled(
     old_weight: RowGroups[Array],
     most: float,
 ) -> bool:
-    """Whether scales change by less than ``most``, relative, and weights by less than ten times."""
+    """Whether scales changed by less than ``most``, relative, and weights by less than 10
+    ``most``.
+    """
     change = [np.abs(new / old - 1).max() for new, old in zip(scale, old_scale, strict=True)]
     change += [
         0.1 * np.abs(new - old).max(initial=0.0)
@@ -406,7 +422,9 @@ def _solved(
     tolerance: float,
     options: BatchOptions,
 ) -> BatchResult:
-    """Solution with given weights up to a tolerance, from a state reached after ``steps`` (B,)."""
+    """Solution with given weights up to a tolerance, started from a state that took ``steps``
+    (B,).
+    """
     parts = zip(weight._replace(edges=weight.edges * irls_weight), scale, strict=True)
     used = problem.weighted(RowGroups(*(own / each[:, None, None] ** 2 for own, each in parts)))
     solution, info = _searched(used, state, steps, tolerance, options)
@@ -416,7 +434,9 @@ def _solved(
 def _searched(
     problem: Problem, state: BatchState, steps: Integers, tolerance: float, options: BatchOptions
 ) -> tuple[Solution, Information]:
-    """Solution up to a tolerance, from a state reached after ``steps`` (B,)."""
+    """Minimum up to a tolerance, started from a state that took ``steps`` (B,), and its
+    linearization.
+    """
     solution = minimise(
         problem.as_noisy_as_at(state), state, tolerance=tolerance, options=options.search
     )
@@ -425,11 +445,12 @@ def _searched(
 
 
 def _edges(fit: BatchResult, by_tube: bool, number: int, options: BatchOptions) -> EdgeScatter:
-    """Noise of the edges: by tube where light shifts edges, otherwise one factor for all.
+    """Noise of the edges: for each tube if light shifts edges, otherwise one factor for all.
 
-    The one factor makes their chi2 equal its degrees of freedom, with normal errors. That is also
-    the optimum of the likelihood, except that edges count as stated; heavy tails would absorb the
-    effect of wrong readings on some edges. number : of the round.
+    The single factor makes the edges' chi2 equal its degrees of freedom, with normal errors. That
+    is also the optimum of the likelihood, except that rejected edges count as stated. Heavy tails
+    are not used there: they would absorb the effect of wrong readings on some edges. number : of
+    the round.
     """
     if by_tube:
         late = number >= options.free_rounds
@@ -456,10 +477,10 @@ def _edges(fit: BatchResult, by_tube: bool, number: int, options: BatchOptions) 
 
 
 def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
-    """Factor (B,) on the stated noise of poses, or of links, that makes their chi2 equal its
-    degrees of freedom.
+    """Factor (B,) on the stated noise of poses or links that makes their chi2 equal its degrees of
+    freedom.
 
-    scale : (B,) factor in use, kept where too few measurements remain to judge it.
+    scale : (B,) factor in use, unchanged where too few degrees of freedom remain.
     """
     kinds = fit.info.problem.row_groups
     if not (kinds.poses if kind == POSE_ROWS else kinds.links).present.any():
@@ -486,7 +507,7 @@ def _shading_of(fit: BatchResult, least: Array, options: LineShadingOptions) -> 
 class MarginalPrior:
     """Information of measurements and nominal model on a machine, as the prior of another estimate.
 
-    free : (n,) its free unknowns.
+    free : (n,) mean of the free unknowns.
     root : (n, n) with ``root^T root`` the inverse of their marginal covariance.
     """
 
@@ -494,8 +515,9 @@ class MarginalPrior:
     root: Array
 
     def like(self, before: MarginalPrior) -> bool:
-        """Whether the machine changed by less than half its standard deviations, as it does until
-        the information has grown by a quarter.
+        """Whether the machine differs by less than half of its standard deviations (RMS).
+
+        Such a difference is usual until the information has grown by a quarter.
         """
         change = 2 * self.root @ (self.free - before.free)
         return float(change @ change) < len(change)
@@ -518,18 +540,18 @@ def bundle(
     """Joint estimate of one session.
 
     start : initial value of every unknown, see :func:`pkmcal.identify.start.start_state`.
-    use_prior : use the nominal model's values as measurements with their prior sigmas; radii and
-        edge shifts keep theirs in any case.
-    marginal_prior : information of other measurements and of the nominal model on the machine, in
-        place of the nominal model, whatever ``use_prior``.
+    use_prior : use the nominal values as measurements with their prior sigmas; radii and edge
+        shifts keep their priors in any case.
+    marginal_prior : information of other measurements on the machine; replaces the nominal prior,
+        whatever ``use_prior``.
     robust : reject edges, poses and links that do not fit.
     scale_noise : estimate factors on the stated noise of edges, poses and links where the residuals
         require it.
-    scale_readings : estimate that of the readings too, which may become smaller.
+    scale_readings : estimate the factor of the readings too, which may be below 1.
     gauge : frames of the result, three centres by default.
-    hopeless : factor on the poses' noise above which the search is given up, for trials.
+    hopeless : factor on the poses' noise above which the search is abandoned, for trial poses.
 
-    Raises ResultError if the search cannot start, is given up, or does not converge.
+    Raises ResultError if the search cannot start, is abandoned, or does not converge.
     """
     gauge = gauge or default_gauge(machine)
     assembled, result = _assembled_fit(
@@ -565,9 +587,10 @@ class Fit(NamedTuple):
 
 
 def marginalize_to_machine(info: Information) -> MarginalPrior:
-    """Information of a linearized estimate on the machine, for the estimate of other measurements.
+    """Marginal prior of the machine from a linearized estimate, for the estimate of other
+    measurements.
 
-    The frames have the nominal model's uncertainty, about their place in the estimate.
+    The frames keep the nominal model's uncertainty, about their position in the estimate.
     """
     rows, _ = reduced_rows(info, ("machine",), silent=())
     root: Array = np.asarray(np.linalg.qr(rows, mode="r"))
@@ -628,6 +651,7 @@ def _assembled_fit(
     # the prior of mounts is centred at their start
     mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
     problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
+    # the marginal prior replaces the nominal rows
     if marginal_prior is not None:
         drawn, u = np.array(assembled.priors) == "nominal", problem.unknowns
         prior, target = problem.prior.copy(), problem.prior_target.copy()
@@ -637,6 +661,7 @@ def _assembled_fit(
         )
         problem = replace(problem, prior=prior, prior_target=target)
     result = solve_batch(problem, batch, hopeless=hopeless, **options)
+    # a failed search is an error, not a result
     if result.scale.poses[0] > hopeless:
         raise ResultError(
             what="the measured poses do not fit the machine",
@@ -661,14 +686,17 @@ def _estimate(
     shared, u = result.covariance[0], problem.unknowns
     if measurements.imputation_covariance:
         shared = shared + measurements.imputation_covariance * covariance_by_noise(result.info)[0]
+    # state and covariance in the gauge
     solved = state_of(assembled, solution, start)
     full = machine_covariance(problem, machine, solved, shared, gauge)
     state = in_gauge(machine, solved, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
+    # effects and lines
     identified = machine.with_values(state.theta)
     parts = {code: u.of_code(code) for code, _ in u.codes}
     covariance = {code: shared[part, part] for code, part in parts.items()}
     line_sigma = np.sqrt(np.diagonal(shared)[u.of_code(SHADING)])
+    # residuals and weights by measurement
     edges, poses, links = problem.unweighted(solution)
     residuals = RowGroups(
         assembled.places.edges.taken(edges[0]),
@@ -729,16 +757,18 @@ def _statistics(
     kinds = np.array(assembled.priors)
     rows = [kind.rows for kind in problem.row_groups]
     rows.insert(1, problem.closure_rows)
+    # sums of squares by kind
     chi2 = [float(np.sum(value[0, :, part] ** 2)) for part in rows]
     chi2[0] = float(np.sum(result.edges.squares(problem.blocks, value[..., rows[0]])))
     drawn = ~np.isin(kinds, ("gauge", "mount"))
     prior = problem.prior_values(state)[0] - problem.prior_target
     chi2_drawing = float(np.sum(prior[drawn] ** 2))
+    # numbers of data, and the rank of the unknowns
     n_edges, n_poses, n_links = (float(number[0]) for number in counts(problem, result.weight))
     n_joints = value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
-    # the prior of mounts is no measurement: unknowns that nothing else determines count
-    # as little as it does
+    # Prior rows of mounts and gauge are not data, so neither they nor unknowns that only they
+    # determine count among the degrees of freedom.
     prior_rows = problem.prior[~np.isin(kinds, ("gauge", "mount"))]
     normal = result.info.by_kind.every[0] + prior_rows.T @ prior_rows
     own = value.shape[1] * problem.layout.own_motion.shape[1] - problem.unknowns.n_linked
@@ -777,8 +807,9 @@ def _statistics(
 
 
 def _range(shares: NoiseShares, scale: Array) -> tuple[float, float | None]:
-    """Interval of the factor on a stated noise, where ``scale`` (1,) is in use; None for no upper
-    end.
+    """Confidence interval of the factor on a stated noise; None for no upper bound.
+
+    scale : (1,) factor in use.
     """
     low, high = (float((scale * end)[0]) for end in shares.interval())
     return low, high if np.isfinite(high) else None

@@ -1,8 +1,8 @@
 """Joint centres of nominal model and calibration in one frame, with gauge-free covariances.
 
-The frame of a machine is a convention: fixing it by three joints makes these look exact and puts
-their errors on the others. So nominal model and calibration are registered by least squares ([B]
-eq. 15), and the covariances are those about that fit.
+The frame of a machine is a convention. A frame defined by three joints makes these appear exact and
+adds their errors to the other joints. So nominal model and calibration are registered by least
+squares ([B] eq. 15), and the covariances are those about that fit.
 """
 
 from __future__ import annotations

@@ -1,22 +1,23 @@
-"""Confirmation of rejections by the other measurements.
+"""Confirmation of rejections by the other measurements: model averaging over what may be wrong.
 
-An estimate with rejected measurements is one hypothesis, "these are wrong". Other hypotheses are
-that one rejected measurement is right, and the parameters differ; that all are right; or that one
-is right and another one, so far an inlier, is wrong. With the cost of a hypothesis a
+An estimate with rejected measurements is one hypothesis. Alternative hypotheses are that one
+rejected measurement is right, that all are right, or that one is right and an inlier is wrong; the
+parameters differ accordingly. With the cost of a hypothesis a
 
-    Q_a = (sum of squares of the inliers, at their best fit) + (loss of each rejected one)
+    Q_a = (sum of squares of the inliers, at their best fit) + (loss of each rejected measurement)
 
 as in the estimate's robust loss, its probability is p_a ~ exp(-Q_a / 2). Under hypothesis a the
 tool is displaced by s_a from the estimate, so the tool's variance has to contain ``sum p_a s_a^2``.
 Where that exceeds the stated variance, the data do not determine which measurement is wrong: one
 that was rejected among seven with seven unknowns is as likely right as any other; one of thirty
-that lies twenty standard deviations off is surely wrong.
+that lies twenty standard deviations off is almost certainly wrong.
 
 A rejection has to be confirmed by measurements, not by the nominal model, which the calibration is
-to correct. So prior sigmas are ``CONTRADICTION_SIGMAS`` times as wide here.
+to correct. So prior sigmas are multiplied by ``CONTRADICTION_SIGMAS`` here.
 
 Hypotheses are solved to first order about the estimate, with each configuration's own unknowns
-eliminated; a hypothesis changes the normal equations of one configuration or two.
+eliminated (Schur complement); a hypothesis changes the normal equations of one or two
+configurations.
 """
 
 from __future__ import annotations
@@ -52,12 +53,12 @@ hypothesis rejects."""
 
 @dataclass(frozen=True)
 class RejectedUnit:
-    """A rejected unit of measurement, as a user took it: a height, a board, an image, a distance.
+    """A rejected unit of measurement: a height, a board, an image, a distance.
 
     pose : number among the measured poses, -1 for other units.
     station, configuration : of the unit; for a link -1 and its second configuration.
-    right : probability that it is right after all.
-    shift : root mean square displacement of the tool by the hypotheses in which it is right, m.
+    right : posterior probability that the unit is not wrong.
+    shift : root mean square displacement of the tool over the hypotheses in which it is right, m.
     link : number among the links, -1 for other units.
     """
 
@@ -78,8 +79,8 @@ class RejectedUnit:
 class Rejections:
     """Rejected units of an estimate.
 
-    shift : root mean square displacement of the tool because they may be right, beside its stated
-    standard deviation, m.
+    shift : root mean square displacement of the tool over all hypotheses, m, to be added to its
+        stated standard deviation.
     """
 
     units: tuple[RejectedUnit, ...] = ()
@@ -101,11 +102,11 @@ class _Normal(NamedTuple):
         return _Normal(*(a + times * b for a, b in zip(self, other, strict=True)))
 
     def at(self, which: Integers | slice) -> _Normal:
-        """Some of the normal equations."""
+        """Normal equations of some configurations or hypotheses."""
         return _Normal(*(part[which] for part in self))
 
     def solution(self) -> tuple[Array, Array]:
-        """Smallest sums of squares (n,), and the steps (n, na) to the solutions."""
+        """Minimal sums of squares (n,), and the steps (n, na) to the minima."""
         scale = np.sqrt(np.einsum("...ii->...i", self.matrix))
         scale = np.where(scale > 0, scale, 1.0)
         unit = self.matrix / scale[..., None] / scale[..., None, :]
@@ -115,8 +116,8 @@ class _Normal(NamedTuple):
 
 
 def rejected_units(measurements: Measurements, estimate: Estimate) -> tuple[RejectedUnit, ...]:
-    """Measured poses and links of less than half of their weight, and images of which most edges
-    are rejected.
+    """Measured poses and links with less than half of their weight, and images with a majority of
+    rejected edges.
     """
     poses, edges = measurements.poses, measurements.edges
     lost = np.flatnonzero(estimate.pose_weights < INLIER_WEIGHT).tolist()
@@ -155,8 +156,10 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
     cost, shift, member = list[Array](), list[Array](), list[Integers]()
 
     def add(case: _Normal, loss: Array, of: Integers) -> None:
-        """Add hypotheses, with their losses (n,) relative to the estimate, and the unit of each, -1
-        for all.
+        """Append hypotheses.
+
+        loss : (n,) loss relative to the estimate. of : (n,) number of the readmitted unit, -1 for
+            all.
         """
         solution, to = case.solution()
         away = (to - step)[:, problem.unknowns.machine] @ rows.T
@@ -179,7 +182,7 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
             other = row != cases.row[k]
             case = single.at(slice(k, k + 1)).plus(dropped.at(other))
             add(case, loss[other] - cases.loss[k], np.full(int(other.sum()), k))
-    # probabilities, that of the estimate itself included
+    # posterior probabilities, normalized together with that of the estimate itself
     costs, shifts, of = (np.concatenate(part) for part in (cost, shift, member))
     best = min(float(costs.min(initial=0.0)), 0.0)
     weight = np.exp(-(costs - best) / 2)
@@ -197,10 +200,9 @@ class _Cases(NamedTuple):
     """Terms of the normal equations from which hypotheses are composed.
 
     base : normal equations of the estimate (1).
-    readmission : change of these by each rejected unit (n).
-    loss : (n,) loss of each unit as rejected.
-    row : (n,) configuration of each unit in the problem, for poses; IMAGE_ROW for images, LINK_ROW
-    for links.
+    readmission : change of the normal equations by each readmitted unit (n).
+    loss : (n,) loss of each unit while rejected.
+    row : (n,) configuration of each pose in the problem; IMAGE_ROW for images, LINK_ROW for links.
     in_use, losses : (K, G) of poses and of links: whether each is in use, and its loss if rejected.
     """
 
@@ -275,8 +277,10 @@ class _Cases(NamedTuple):
         return cls(problem, base, readmission, np.array(loss), np.array(rows), in_use, losses)
 
     def drops(self, state: BatchState) -> Iterator[tuple[_Normal, Array, Integers]]:
-        """Changes of the normal equations by rejecting one more pose or link each, its loss, and
-        its configuration in the problem (DROPPED_LINK_ROW for links), some at a time.
+        """Changes of the normal equations if one more pose or link is rejected.
+
+        Yields, for groups of n hypotheses, the changes, the losses (n,), and the configurations
+        (n,) in the problem, DROPPED_LINK_ROW for links.
         """
         if not (self.row != IMAGE_ROW).any():
             return
@@ -295,13 +299,13 @@ class _Cases(NamedTuple):
                     without = part.weighted(weights._replace(**{name: weight}))
                     change = _normal_equations(without, there).plus(before, -1.0)
                     row = np.arange(len(used))[cut][in_use]
-                    # a link's row touches no own unknowns: its change adds to that of any unit
+                    # a link's row has no own unknowns, so its change adds to that of any unit
                     of = row if name == "poses" else np.full(len(row), DROPPED_LINK_ROW)
                     yield change.at(in_use), losses[row, place], of
 
 
 def _normal_equations(problem: Problem, state: BatchState) -> _Normal:
-    """Normal equations of each configuration, its own unknowns eliminated."""
+    """Reduced normal equations of each configuration."""
     reduced = Information(problem, state).reduced
     rows, value = reduced.rows[0], reduced.value[0]
     return _Normal(rows.mT @ rows, (rows.mT @ value[..., None])[..., 0], np.sum(value**2, axis=-1))

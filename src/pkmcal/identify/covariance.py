@@ -1,9 +1,9 @@
-"""Covariance, noise scale and rank of the estimate, from exact derivatives.
+"""Covariance and rank of the estimate, from exact derivatives.
 
 The covariance is the inverse of the reduced information at the solution, expressed in a gauge. It
 covers the noise of edges and readings and the nominal model's prior sigmas. Errors of the model
-(joint clearance, bending, a wrong lens) are added elsewhere, as far as residuals show them
-(:mod:`pkmcal.identify.discrepancy`).
+(joint clearance, bending, a wrong lens) are added by :mod:`pkmcal.identify.discrepancy` as far as
+residuals contain them.
 """
 
 from __future__ import annotations
@@ -59,8 +59,10 @@ direction counts as unknown."""
 class Information:
     """Linearized rows of a problem at a state, and the covariance of the shared unknowns.
 
-    normal : (B, na, na) the reduced normal matrix, if it is already computed. The rows of two
-        thousand configurations take a gigabyte, so computations over all of them use ``pieces``.
+    normal : (B, na, na) reduced normal matrix, if it is already computed.
+
+    The rows of two thousand configurations take a gigabyte, so computations over all of them
+    iterate over ``pieces``.
     """
 
     problem: Problem
@@ -74,13 +76,13 @@ class Information:
 
     @cached_property
     def reduced(self) -> Reduced:
-        """The linearized rows with the configurations' own unknowns eliminated."""
+        """Linearized rows with the configurations' own unknowns eliminated."""
         return eliminate(self.linear)
 
     def pieces(self) -> Iterator[Information]:
-        """Parts of the problem, each of as many configurations as the solver processes at once.
+        """Parts of the problem, each with as many configurations as the solver processes at once.
 
-        Rows on shared unknowns only are in every part. A small problem is its own single part.
+        Each part contains all rows on shared unknowns only. A small problem is a single part.
         """
         cuts = self.problem.cuts
         if len(cuts) < 2:
@@ -114,7 +116,7 @@ class Information:
     @cached_property
     def root(self) -> Array:
         """F (B, na, na) with F F^T the covariance of the shared unknowns; unidentifiable directions
-        are left out.
+        have zero variance.
         """
         normal, prior = self.normal, self.problem.prior
         if normal is None:
@@ -127,7 +129,9 @@ class Information:
 
     @cached_property
     def _inverse(self) -> tuple[Array, Booleans]:
-        """Inverse of the normal matrix, and the runs in which it has half of the digits."""
+        """Inverse of the normal matrix, and the runs (B,) in which half of its digits are
+        significant.
+        """
         return normal_inverse(cast(Array, self.normal))
 
     @cached_property
@@ -135,8 +139,8 @@ class Information:
         """Covariance (B, na, na) of the shared unknowns before any gauge; an unidentifiable
         direction has a huge variance.
 
-        Computed from the normal matrix where that leaves half of the digits, otherwise from the
-        rows, which leave all.
+        Computed from the normal matrix where half of the digits remain significant, otherwise from
+        the rows, whose condition number is its square root.
         """
         if self.normal is not None:
             inverse, sure = self._inverse
@@ -153,8 +157,8 @@ class Information:
 
 
 def covariance_by_noise(info: Information) -> Array:
-    """Part of the shared unknowns' covariance (B, na, na) that is due to measurement noise; the
-    rest is due to the priors.
+    """Part of the shared unknowns' covariance (B, na, na) due to measurement noise; the rest is due
+    to the priors.
     """
     in_prior = info.problem.prior @ info.covariance
     return info.covariance - in_prior.mT @ in_prior
@@ -163,18 +167,17 @@ def covariance_by_noise(info: Information) -> Array:
 def reduced_rows(
     info: Information, keep: tuple[str, ...], silent: tuple[str, ...] | None = None
 ) -> tuple[Array, Array]:
-    """Information of the data on the named unknowns with all others marginalized, of the problem's
+    """Information of the data on the named unknowns, all others marginalized, of the problem's
     first run.
 
-    Returns rows A (n, m), in the order of the named unknowns' columns, and residuals y (n,). They
-    are few, with the same normal matrix, gradient and sum of squares as all rows.
+    Returns rows A (n, m), in the order of the named unknowns' columns, and residuals y (n,). Rows
+    are condensed: they have the same normal matrix, gradient and sum of squares as all rows.
 
-    Each configuration's own unknowns are eliminated, and the span of all other shared unknowns is
-    projected out: ``y + A x`` are the residuals that remain when the named unknowns change by x,
-    and their optimum is its least-squares solution. Prior rows count too, except those on the
-    ``silent`` unknowns, by default the named ones, so that A is the information of the data alone.
-
-    For parameters that the problem holds, open it first, as drift tests do::
+    Each configuration's own unknowns are eliminated, and the range of all other shared unknowns is
+    projected out: ``y + A x`` are the residuals that remain when the named unknowns change by x and
+    all others are re-estimated, and the least-squares solution x is the estimate. Prior rows are
+    included, except those on the ``silent`` unknowns, by default the named ones, so that A is the
+    information of the data alone. To include parameters that the problem holds, open it first::
 
         rows, residuals = reduced_rows(Information(*problem.opened(state)), ("machine",))
 
@@ -220,6 +223,7 @@ def prior_in_gauge(
     spread : (n, m) derivative by the quantities whose covariance is ``shared`` (m, m).
     """
     estimated = estimated_unknowns(before)
+    # exact change of the frames, then the S-transformation of the errors
     e, f = alignment(machine, before, gauge)
     after = changed_frames(machine.layout, before, e, f)
     spread = carried_errors(machine.layout, before, e, f) @ spread
@@ -250,9 +254,9 @@ def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) 
 class ParameterDirection:
     """Combination of parameters, with the information that the data have on it.
 
-    names, weights : of its largest components, largest first.
-    information : singular value of the data in units of the prior sigmas; 1 means that the data
-        determine it as well as the nominal model does.
+    names, weights : largest components, in descending order.
+    information : singular value of the data's rows in units of the prior sigmas; at 1 the data
+        determine the direction as well as the nominal model does.
     vector : (P,) change of all parameters, m and rad, with the largest entry one prior sigma.
     """
 
@@ -266,12 +270,12 @@ class ParameterDirection:
 class Identifiability:
     """Directions of the machine that the data alone determine, apart from frames.
 
-    n_parameters : free ones.
-    n_frames : freedoms of the frames, and of the zeros of hinges.
+    n_parameters : number of free parameters.
+    n_frames : number of gauge freedoms, of the frames and of the zeros of hinges.
     rank : number of directions that the data determine.
-    unidentified : directions that no amount of such data determines.
+    unidentified : directions in the null space of the data.
     weak : directions that the nominal model determines better than the data.
-    singular_values : (n,) of the data's information in units of the prior, the largest first.
+    singular_values : (n,) of the data's rows in units of the prior sigmas, in descending order.
     directions : (n, P) their changes of all parameters, m and rad, each of length one in prior
         sigmas.
     """
@@ -288,30 +292,31 @@ class Identifiability:
 
     @property
     def basis(self) -> Array:
-        """Changes (n, P) of all parameters that do not affect the data, m and rad."""
+        """Basis (n, P) of the null space: changes of all parameters that do not affect the data, m
+        and rad.
+        """
         vectors = [d.vector for d in self.unidentified]
         size = next((d.vector.size for d in (*self.unidentified, *self.weak)), self.n_parameters)
         return np.array(vectors).reshape(-1, size)
 
 
 def identifiability(info: Information, machine: Machine) -> Identifiability:
-    """Combinations of parameters that the data determine, without the nominal model, of the
-    problem's first run.
+    """Rank of the data on the machine, without the nominal model, of the problem's first run.
 
-    Poses, stations, edge shifts and shading are eliminated, frames projected out, and the columns
+    Poses, stations, edge shifts and shading are marginalized, frames projected out, and the columns
     are scaled by the nominal model's prior sigmas.
     """
     problem, state = info.problem, info.state
     table, nz = machine.parameters, problem.unknowns.n_free
     tolerance = table.tolerances_free()
-    # priors of cameras and shading are used: without them, a shift of
-    # every line by itself would hide the tubes' radii
+    # Priors of cameras and shading are used: without them, independent shifts of all lines would
+    # be equivalent to changes of the tubes' radii.
     remainder = reduced_rows(info, ("machine",), silent=("machine", "mounts"))[0] * tolerance
     theta, moves = problem.theta(state)[0], conventions(machine)
     shifted = move_generators(machine.layout, theta) @ moves
     shifted = np.linalg.lstsq(problem.free, shifted, rcond=None)[0]
     basis = np.linalg.qr(shifted / tolerance[:, None], mode="complete")[0][:, moves.shape[1] :]
-    # a square R has all right vectors, however few rows there are
+    # the R factor is square, so vt is complete however few rows there are
     _, s, vt = np.linalg.svd(np.linalg.qr(remainder @ basis, mode="r"), full_matrices=True)
     s = np.pad(s, (0, len(vt) - len(s)))
     directions = vt @ basis.T

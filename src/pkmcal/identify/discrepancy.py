@@ -1,44 +1,47 @@
-"""Model discrepancy: what the model leaves out, as random effects with estimated scales.
+"""Model discrepancy: errors of the model, as random effects with estimated scales.
 
-A *component* is a family of functions that could be missing from the model: errors of the readings
-that vary smoothly over the workspace, say. Each function is a column G of derivatives of all rows,
-in standard deviations, and its coefficient is random, ``w ~ N(0, s^2 L L^T)`` with a known L.
+A *component* is a family of functions that could be missing from the model, for example errors of
+the readings that vary smoothly over the workspace. Each function is a column G of derivatives of
+all rows, in standard deviations, and its coefficient is random, ``w ~ N(0, s^2 L L^T)`` with a
+known L.
 
 Evidence
 --------
-With J the Jacobian at the solution, r its residuals and ``H = (I - J J^+) G`` what the unknowns
-leave of the columns, ``h = H^T r`` and ``M = H^T H``,
+With J the Jacobian at the solution, r its residuals, ``H = (I - J J^+) G`` the columns projected
+orthogonally to the unknowns, ``h = H^T r`` and ``M = H^T H``,
 
     h ~ N(0, M + s^2 M L L^T M)
 
-so s has a likelihood of its own, the restricted one (Patterson and Thompson 1971). A component is
-believed where its likelihood ratio is beyond what chance gives at a level that all components
-share; half of a chi-square variable of one degree of freedom, since s cannot be negative (Self and
-Liang 1987). Components are taken up one after the other, the one with the largest ratio first, each
-beside those before it. Model violations that have names take part, each a component of its own: one
-that explains more than smooth functions do is taken up before them, one that explains less is left
-without anything to explain.
+so s has a restricted likelihood (REML; Patterson and Thompson 1971). A component is accepted if its
+likelihood ratio exceeds the threshold of a level that all components share. Under the model the
+ratio has the distribution of half a chi-square variable of one degree of freedom, since s cannot be
+negative (Self and Liang 1987). Components are selected forward: the one with the largest ratio is
+added first, and each further one is tested beside those before it. Named model violations take
+part, each as a component of its own: a violation that explains more than the smooth functions is
+selected before them; otherwise nothing remains for it to explain.
 
-Where the estimate has enlarged the noise of readings or poses, the discrepancy may be what enlarged
-it: the two are compared by the restricted likelihood of both, and a component of the readings, or
-poses, needs no further evidence, for that something is left out is known already: the covariance
-contains it. It is sure, and worth naming, only where it explains the data better than noise alone
-does, at the same level.
+Where the estimate has enlarged the noise of readings or poses, the reason may be the discrepancy.
+The two explanations are compared by the restricted likelihood of both, and components of the
+readings, or poses, then need no further evidence, because the enlarged noise has established that
+the model is incomplete: the covariance contains them. They are reported as a discrepancy (``sure``)
+only if they explain the data better than noise alone, at the same level.
 
-Heights are one number of a configuration, and nearly all that a violation does to them a smooth
-surface does as well. So a violation takes part only where the data are surely better explained with
-it than by smooth functions and noise. A probe's noise is stated as a guess, and one that is too
-large hides the surface: smaller ones are compared too, and then all of it has to be sure.
+A height is one number per configuration, and a smooth surface can reproduce almost any effect of a
+violation on heights. So a violation takes part only if the data are significantly better explained
+with it than by smooth functions and noise. The stated noise of a probe is often a guess, and too
+large a value hides the surface: smaller values are tried too, and then the whole discrepancy has to
+be significant.
 
 Covariance
 ----------
-The discrepancy has moved the unknowns by ``J^+ G w``. With m and C the mean and the covariance of w
-given the data, the mean square of that is
+The discrepancy has changed the unknowns by ``J^+ G w``. With m and C the posterior mean and
+covariance of w, the mean square of that change is
 
     J^+ G (m m^T + C) (J^+ G)^T
 
-and is added to the unknowns' covariance. Functions that the data see count as they are seen. Those
-that the unknowns absorb keep the scale that the visible ones have (Kennedy and O'Hagan 2001).
+and is added to the unknowns' covariance. For functions that the data determine, this is the effect
+of their estimates. Functions that the unknowns absorb keep their prior variance, with the scale
+estimated from the other functions of their component (Kennedy and O'Hagan 2001).
 """
 
 from __future__ import annotations
@@ -73,27 +76,26 @@ by this factor, in the same memory."""
 class DiscrepancyOptions:
     """Constants of the search."""
 
-    # level of the session, of which the components share that of their search
+    # level of the session; components share the part of Search.DISCREPANCY
     false_alarm: FalseAlarm = SESSION_FALSE_ALARM
-    # factor on a stated noise from which the discrepancy may be what enlarged it
+    # factor on a stated noise from which a discrepancy is considered as its cause
     enlarged: float = RELEVANT_FACTOR
-    # factors tried then, from what was stated to what is in use
+    # number of noise levels tried then, from the stated noise to the noise in use
     noise_factors: int = 5
-    # smallest part of a probe's stated noise that is tried, and how many factors: new sessions
-    # state 20 um, and good probes repeat to 2
+    # smallest factor on a probe's stated noise, and number of noise levels: new sessions state
+    # 20 um, and good probes repeat to 2 um
     least_probe_noise: float = 0.1
     probe_noise_factors: int = 9
-    # components in one session at most; more are a session with other troubles
+    # largest number of components of a session
     most: int = 4
-    # scales tried for each component, geometrically between hardly visible and nothing else visible
+    # number of scales s tried for each component, on a geometric grid from an effect far below the
+    # noise to one far above it
     scales: int = 121
-    # part of a squared column that has to be left beside the unknowns; less is rounding
+    # squared length of a column's projection relative to the column, below which it is rounding
     rank: float = 1e-10
 
     def least_ratio(self, components: int) -> float:
-        """Twice the logarithm of the likelihood ratio beyond which one of so many components is no
-        chance.
-        """
+        """Threshold of twice the log likelihood ratio of one among ``components`` components."""
         from scipy.special import chdtri
 
         return float(chdtri(1.0, 2 * self.false_alarm.of_test(Search.DISCREPANCY, components)))
@@ -101,12 +103,13 @@ class DiscrepancyOptions:
 
 @dataclass(frozen=True)
 class Component:
-    """A family of functions with one scale.
+    """A family of k functions with one scale.
 
-    column : what the k functions do to the measurements. roots : the L (k, l)
-    to choose from, of functions with a mean square of one over the session's configurations.
-    inflates : kinds of rows whose noise such an error enlarges, as READING_ROWS. lengths : of
-    the same number as roots, m, the correlation length of each; empty where there is none.
+    column : derivatives of the measurements by the k coefficients.
+    roots : candidate roots L (k, l) of the coefficients' covariance; the functions have a mean
+        square of one over the session's configurations.
+    inflates : kinds of rows whose noise such an error enlarges, such as READING_ROWS.
+    lengths : correlation length of each root, m; empty for a component without one.
     """
 
     column: Column
@@ -116,15 +119,18 @@ class Component:
 
     @property
     def code(self) -> str:
-        """For programs."""
+        """Code of the component's column."""
         return self.column.code
 
 
 @dataclass(frozen=True)
 class ComponentScale:
-    """A detected component. scale : s, in the unit of its functions. ratio : twice the
-    logarithm of the likelihood ratio against no such component. length : correlation length of the
-    likeliest root, m; None where the component has none.
+    """A detected component.
+
+    scale : s, in the unit of its functions.
+    ratio : twice the log likelihood ratio against a model without the component.
+    root : (k, l) the most likely of its roots L.
+    length : correlation length of that root, m; None for a component without one.
     """
 
     code: str
@@ -138,10 +144,11 @@ class ComponentScale:
 class Discrepancy:
     """Estimated model discrepancy.
 
-    scales : of those, the surest first. shared : (na, na) what is added to the covariance of the
-    shared unknowns. random : their columns, with the priors that the data show. mean,
-    covariance : (l,) and (l, l) of the coefficients of these priors' roots, given the data. sure :
-    whether they explain the data better than larger noise alone does.
+    scales : detected components, in the order of their selection.
+    shared : (na, na) addition to the covariance of the shared unknowns.
+    random : columns of the components, with their estimated priors.
+    mean, covariance : (l,) and (l, l), posterior of the coefficients in prior standard deviations.
+    sure : whether the components explain the data significantly better than larger noise does.
     """
 
     scales: tuple[ComponentScale, ...]
@@ -154,9 +161,13 @@ class Discrepancy:
 
 @dataclass(frozen=True)
 class _Products:
-    """Products of the columns that the unknowns leave: squared (c, c) M, value (c,) h; gain (na, c)
-    J^+ G of the shared unknowns. whole : (c, c) of the columns themselves. likelihood : restricted,
-    without any component.
+    """Products of the columns G and of their projections H, c columns in all.
+
+    squared : (c, c) M = H^T H.
+    value : (c,) h = H^T r.
+    gain : (na, c) J^+ G of the shared unknowns.
+    whole : (c, c) G^T G, with the own unknowns eliminated.
+    likelihood : log restricted likelihood without any component.
     """
 
     squared: Array
@@ -167,7 +178,7 @@ class _Products:
 
 
 def no_discrepancy(info: Information) -> Discrepancy:
-    """A discrepancy without components."""
+    """Discrepancy without components."""
     na = info.problem.unknowns.count
     return Discrepancy((), np.zeros((na, na)), (), np.zeros(0), np.zeros((0, 0)))
 
@@ -181,12 +192,14 @@ def discrepancy_of(
     heights: bool = False,
     options: DiscrepancyOptions = DiscrepancyOptions(),
 ) -> Discrepancy:
-    """The discrepancy at a solution; the problem's first run.
+    """Estimate the discrepancy at a solution, for the problem's first run.
 
-    named : columns of the model violations that were found otherwise, which take part with a scale
-    each: what they explain better is theirs, and not in the result. enlarged : factors in use on
-    the stated noise of the readings and of the poses. heights : whether nothing else was measured.
+    named : columns of the detected model violations. They compete as components of their own, and
+        the part of the data that they explain is not in the result.
+    enlarged : factors in use on the stated noise of the readings and of the poses.
+    heights : whether only heights were measured.
     """
+    # violations compete with the smooth components, with one scale each
     rivals = [
         Component(replace(column, code=f"{NAMED}{k}"), (np.eye(column.count),))
         for k, column in enumerate(named)
@@ -196,12 +209,14 @@ def discrepancy_of(
     ends = np.cumsum([0, *(column.count for column in columns)]).tolist()
     parts = [slice(*ends[k : k + 2]) for k in range(len(every))]
     at_solution = _products(assembled, info, columns)
+    # products at the noise in use, and at the other noise levels
     kind = (READING_ROWS, POSE_ROWS)[int(np.argmax(enlarged))]
     inflated = kind if max(enlarged) > options.enlarged else None
     noises = [at_solution]
     for shares in _noise_shares(enlarged, heights, options):
         other = _with_noise(assembled, shares)
         noises.append(_products(other, Information(other.problem, info.state), columns))
+    # selection from all components, smooth ones, violations, none; each at its most likely noise
     smooth_end = len(components)
     best, smooth, named_only, noise_alone = (
         max(
@@ -215,10 +230,13 @@ def discrepancy_of(
             ((), ()),
         )
     )
+    # evidence against noise alone, without the part of the violations
     beyond = options.least_ratio(len(every))
+    # ratio against noise alone, without the part of the violations
     named_ratios = [one.ratio for one in best.scales if one.code.startswith(NAMED)]
     log_likelihood_ratio = 2 * (best.likelihood - noise_alone.likelihood) - sum(named_ratios)
     if heights:
+        # heights: violations take part only if needed beside the smooth functions
         needless = 2 * (best.likelihood - smooth.likelihood) <= beyond
         best, against = (smooth, noise_alone) if needless else (best, named_only)
         log_likelihood_ratio = 2 * (best.likelihood - against.likelihood)
@@ -226,7 +244,7 @@ def discrepancy_of(
     scales = tuple(one for one in best.scales if not one.code.startswith(NAMED))
     if not scales or (heights and inflated is None and not sure):
         return no_discrepancy(info)
-    # scales by the noise that fits best, gains by the weights with which the estimate was made
+    # scales by the most likely noise, gains by the weights of the estimate; without the violations
     unnamed = ~np.any(best.root[ends[smooth_end] :], axis=0)
     root = best.root[: ends[smooth_end], unnamed]
     gain = at_solution.gain[:, : ends[smooth_end]] @ root
@@ -241,7 +259,8 @@ def discrepancy_of(
 class _Search:
     """Forward selection of components.
 
-    root : (c, l) prior root of all columns that are taken up. gain : of the log likelihood.
+    root : (c, l) prior root of the coefficients of all columns, for the selected components.
+    gain : increase of the log likelihood.
     """
 
     def __init__(
@@ -252,7 +271,10 @@ class _Search:
         options: DiscrepancyOptions,
         enlarged: int | None,
     ) -> None:
-        """Select components; enlarged : kind of rows with enlarged noise, None for none."""
+        """Select components.
+
+        enlarged : kind of rows whose noise is enlarged, None if there is none.
+        """
         self.products, self.components, self.parts = products, components, parts
         self.options = options
         self.scales: list[ComponentScale] = []
@@ -261,6 +283,7 @@ class _Search:
         beyond = self.options.least_ratio(len(self.components))
         named = sum(one.code.startswith(NAMED) for one in self.components)
         while len(self.scales) < self.options.most + named:
+            # scale and likelihood ratio of each remaining component, with each of its roots
             squared, value = self._remainder()
             codes = {one.code for one in self.scales}
             best: ComponentScale | None = None
@@ -279,6 +302,7 @@ class _Search:
                         best = ComponentScale(one.code, scale, ratio, root, length)
             if best is None:
                 return
+            # the most likely one becomes part of the noise
             self.scales.append(best)
             self.gain += best.ratio / 2
             (k,) = (k for k, one in enumerate(self.components) if one.code == best.code)
@@ -287,7 +311,7 @@ class _Search:
             self.root = np.concatenate([self.root, more], axis=1)
 
     def _remainder(self) -> tuple[Array, Array]:
-        """M and h of all columns beside the selected components as noise."""
+        """M and h of all columns, with the selected components as part of the noise."""
         n = len(self.root)
         squared, value = self.products.squared[:n, :n], self.products.value[:n]
         across = squared @ self.root
@@ -312,7 +336,7 @@ class _Search:
 
     @property
     def coefficients(self) -> tuple[Array, Array]:
-        """Mean (l,) and covariance (l, l) of the taken coefficients given the data, in prior
+        """Posterior mean (l,) and covariance (l, l) of the selected coefficients, in prior standard
         deviations.
         """
         covariance = self._posterior
@@ -325,7 +349,8 @@ class _Search:
         m, z = m[visible], vectors[:, visible].T @ value
         if not m.size:
             return 0.0, 0.0
-        # from where the best seen function is hardly seen to where the least seen one is all
+        # grid of s^2: from a negligible effect of the best observable function to a dominant
+        # effect of the worst one
         square = np.geomspace(1e-3 / m[-1], max(1e3 / m[0], 1e-2 / m[-1]), self.options.scales)
         load = square[:, None] * m
         ratio = np.sum(z**2 / m * load / (1 + load) - np.log1p(load), axis=1)
@@ -336,8 +361,10 @@ class _Search:
 def _noise_shares(
     enlarged: tuple[float, float], heights: bool, options: DiscrepancyOptions
 ) -> list[tuple[float, float]]:
-    """Factors on the noise in use, of readings and of poses, that are tried beside (1, 1): down to
-    what was stated, of the kind that is enlarged most; of heights both, the probe's further.
+    """Factors on the noise in use, of readings and of poses, to try beside (1, 1).
+
+    They reach down to the stated noise of the kind that is enlarged most; for heights of both
+    kinds, and of the probe further.
     """
     count = options.noise_factors
     if heights:
@@ -353,7 +380,7 @@ def _noise_shares(
 
 
 def _with_noise(assembled: Assembled, factors: tuple[float, float]) -> Assembled:
-    """The problem with the noise of readings, and of poses, multiplied by a factor each."""
+    """Problem with the noise of readings, and of poses, multiplied by one factor each."""
     problem = assembled.problem
     poses = replace(problem.pose_data, weight=problem.pose_data.weight / factors[1] ** 2)
     problem = replace(problem, joint_noise=problem.joint_noise * factors[0], pose_data=poses)
@@ -368,6 +395,7 @@ def _products(assembled: Assembled, info: Information, listed: Sequence[Column])
     squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
     in_basis, remainder, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
     configurations, n_rows = problem.extent
+    # sums over the configurations, own unknowns eliminated
     for cut in divisions(configurations, n_rows * COLUMNS_BY_UNKNOWNS, problem.rows_at_once):
         piece = Information(problem.among(cut), problem.state_among(info.state, cut))
         linear = piece.linear
@@ -385,7 +413,8 @@ def _products(assembled: Assembled, info: Information, listed: Sequence[Column])
         remainder += float(residuals @ residuals)
         diagonal = np.einsum("bkii->bki", piece.reduced.r)
         own_scale += float(np.sum(np.log(np.maximum(np.abs(diagonal), 1e-300))))
-    # of the restricted likelihood: the noise's own scale, then the unknowns', then the residuals
+    # terms of the log restricted likelihood: determinants of own and shared unknowns, noise,
+    # residuals
     scale = own_scale + _log_scale(info) + _log_noise(assembled)
     return _Products(
         squared - by_basis @ by_basis.T,
@@ -397,7 +426,9 @@ def _products(assembled: Assembled, info: Information, listed: Sequence[Column])
 
 
 def _log_scale(info: Information) -> float:
-    """Half of the logarithm of the determinant of the shared unknowns' information, where known."""
+    """Half of the log determinant of the shared unknowns' information, over identifiable
+    directions.
+    """
     rows = info.rows[0][0]
     length = np.linalg.norm(rows, axis=0)
     used = length > 0
@@ -407,7 +438,7 @@ def _log_scale(info: Information) -> float:
 
 
 def _log_noise(assembled: Assembled) -> float:
-    """Logarithm of the noise of all readings and poses, up to a constant."""
+    """Sum of the log standard deviations of all readings and poses, up to a constant."""
     problem = assembled.problem
     readings = problem.blocks.present.shape[0] * problem.layout.n_readings
     out = readings * float(np.log(problem.joint_noise[0]))
@@ -417,7 +448,7 @@ def _log_noise(assembled: Assembled) -> float:
 
 
 def _as_motion(assembled: Assembled, column: Column) -> Column:
-    """A moved station as a motion by configuration."""
+    """Column of a moved station as a motion of each configuration."""
     if column.station is None:
         return column
     unknowns = assembled.problem.unknowns

@@ -1,20 +1,21 @@
 """Noise of the edges: scale, shading and tails, by restricted maximum likelihood.
 
 The stated covariance C of an edge is that of the scatter of its profiles. On real surfaces the
-error differs: within an edge the points agree better than their profiles promise, while a highlight
-or a mirrored object shifts an edge as a whole, some far more than others. So the errors of the
-edges of one tube (first, second, ... of all legs) have Student's distribution with the covariance
+error differs: the points of one edge scatter less than their profiles promise, while a highlight or
+a mirrored object shifts an edge as a whole, and some edges far more than others. So the errors of
+the edges of one tube (first, second, ... of all legs) have Student's distribution with the
+covariance
 
     scale^2 C + shading^2 s s^T,      s the change of the normal by a shift of one pixel outward,
 
-and estimated degrees of freedom. Scale, shading and degrees of freedom are found by restricted
-maximum likelihood: the part of an edge's error that the unknowns have absorbed is added to its
-squared residual, by the hat matrix. Each edge has an IRLS weight (Lange, Little, Taylor 1989), and
-the covariance of the result follows from the information of Student's distribution.
+and estimated degrees of freedom. All three are estimated by restricted maximum likelihood: the part
+of an edge's error that the unknowns have absorbed is added to its squared residual, by the hat
+matrix. Each edge has an IRLS weight (Lange, Little, Taylor 1989), and the covariance of the result
+follows from the information of Student's distribution.
 
-The shading of one edge is not independent of its neighbours': edges of a line with similar normals
-are correlated (:mod:`pkmcal.identify.error_correlation`), so the shading's variance is multiplied
-by their number.
+Shading is correlated between edges of a line with similar normals
+(:mod:`pkmcal.identify.error_correlation`), so its variance is multiplied by the number of edges
+that share it.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ from pkmcal.identify.scatter import (
 class EdgeNoiseOptions:
     """Constants of the estimate of the edges' noise."""
 
-    # degrees of freedom that are tried; the last is close to the normal distribution
+    # candidates of the degrees of freedom; the last is close to the normal distribution
     tails: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0)
-    # weight of the stated noise as prior of the scale, in edges
+    # weight of the stated noise as the prior of the scale, as a number of edges
     stated_noise_worth: float = 5.0
     # largest number of scoring steps
     most_rounds: int = 60
@@ -63,10 +64,10 @@ def edge_noise(
     same_tails: bool = False,
     options: EdgeNoiseOptions = EDGE_NOISE,
 ) -> EdgeScatter:
-    """Noise of the edges, tube by tube, at a solution.
+    """Noise of the edges of each tube, at a solution.
 
-    weight : (B, K, G) of edges, 0..1, without their IRLS weight; edges of weight 0 are outliers and
-    are not used.
+    weight : (B, K, G) robust weights 0..1 of the edges, without their IRLS weight; edges of weight
+        0 are outliers and are not used.
     before : start of the iteration; a tube without edges keeps its values.
     same_tails : keep the degrees of freedom of ``before``.
     """
@@ -90,8 +91,8 @@ def edge_noise(
 def _squares(info: Information) -> tuple[Array, Array, Array]:
     """Expected squared errors of the edges in their stated noise, (B, K, G) each.
 
-    Returns the squares along the change by a shift outward and across it, and the square of that
-    change by a shift of one pixel.
+    Returns the squares along the change of the normal by a shift outward, and across it, and the
+    square of that change by a shift of one pixel.
     """
     half, squares = info.root, list[Array]()
     for piece in reduced_edges(info):
@@ -121,11 +122,13 @@ def _student(
 ) -> tuple[Array, Array, Array]:
     """Scale, shading and degrees of freedom (B,) of n edges with the highest likelihood.
 
+    For each candidate of the degrees of freedom, weights and the two variances are updated in
+    turns. With fixed weights the variances are variance components of two normal variables, and an
+    update is one step of Fisher scoring.
+
     along, rest, size, weight : (B, n), see :func:`_squares`.
     scale, shading : (B,) start of the iteration.
-    tried : (V, B or 1) degrees of freedom. For each of them weights and the two variances are
-    updated in turns: with fixed weights these are variance components of two normal variables, and
-    a step is one of Fisher's scoring.
+    tried : (V, B or 1) candidates of the degrees of freedom.
     """
     from scipy.special import gammaln
 

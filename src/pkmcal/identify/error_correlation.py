@@ -1,9 +1,10 @@
 """Covariance of an estimate whose edges have correlated errors.
 
 A highlight or a mirrored object that shifts one edge of a line shifts its neighbours too: the
-errors of two edges whose normals enclose an angle are correlated by ``exp(-angle /
-SHADING_CORRELATION_ANGLE)`` (:class:`~pkmcal.measurements.line_cells.LineCells`); of the shift, the
-part of its variance that is shading; of the tilt, a share ``c`` that is estimated from the data.
+errors of two edges whose normals enclose an angle have the correlation ``exp(-angle /
+SHADING_CORRELATION_ANGLE)`` (:class:`~pkmcal.measurements.line_cells.LineCells`). This applies to
+the part of the shift's variance that is shading, and to a share ``c`` of the tilt's variance that
+is estimated from the data.
 The estimate treats the edges as independent, with the variance of shading multiplied by the number
 of edges that share it. The inverse of its normal matrix would be the right covariance if all these
 edges affected the result in the same way; where a platform's pose absorbs their common error it is
@@ -59,7 +60,7 @@ def covariance_of_correlated(
 ) -> Array:
     """Covariance (B, na, na) of the shared unknowns at a solution, with correlated errors of edges.
 
-    A direction that is not determined has a huge variance.
+    An unidentifiable direction has a huge variance.
     """
     if not info.problem.blocks.cells.count.size:
         return info.covariance
@@ -76,7 +77,7 @@ def covariance_of_correlated(
 
 
 def _beside(info: Information, options: ErrorCorrelationOptions) -> Array:
-    """``F^T J^T (S - 1) J F`` (na, na) of one run, F the root of the covariance."""
+    """Correction ``F^T J^T (S - 1) J F`` (na, na) of one run, with F the root of the covariance."""
     half, cells = info.root, info.problem.blocks.cells
     na = half.shape[-1]
     out, tilts = np.zeros((2, na, na))
@@ -89,7 +90,7 @@ def _beside(info: Information, options: ErrorCorrelationOptions) -> Array:
         own, scale = data.own[0] ** 2 * size, data.scale[0] ** 2
         used = (place >= 0) & (data.weight[0][row, place] > 0)
         cell = np.where(used, blocks.cell[row, place], -1)
-        # share of an edge's variance that is shading, and root of the share by one edge's shading
+        # share of an edge's variance that is shading, and its square root for a single edge
         part = np.where(cell >= 0, (own / (own + scale))[row, place], 0.0)
         once = np.sqrt(part / np.maximum(blocks.n_effective, 1.0)[row, place])
         for cut, shared in piece.shared(half):
@@ -125,8 +126,8 @@ class _Tilts(NamedTuple):
     """Tilts of n edges of one run.
 
     value : (n,) residuals.
-    shared, own : (n, na) and (n, d) the rows' parts by shared and own unknowns in orthonormal
-    bases, so that the hat matrix has their products.
+    shared, own : (n, na) and (n, d) rows by shared and own unknowns in orthonormal bases; the hat
+        matrix is the sum of their products.
     configuration, cell : (n,).
     """
 

@@ -24,20 +24,25 @@ from pkmcal.mechanisms import Machine
 class Statistics:
     """Goodness of fit and noise of an estimate.
 
-    chi2, dof : of all residuals in use (robust weights count as fractions of a datum).
-    chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : by kind of residual.
-    steps : solver steps. stopped : reason in words. noise_scale : factor by which the edges'
-    stated standard deviations had to be enlarged (or shrunk) to agree with the residuals;
-    1 when they were taken as they are. chi2_poses, n_poses : of poses, six numbers of a full one;
-    pose_scale : the same factor of theirs. dof_edges, dof_joints, dof_poses : degrees of freedom
-    that each kind of residual has left; their sum and the nominal model's is ``dof``. shading : px,
-    standard deviation of what the edges of one side of a tube at one station have in common.
+    chi2, dof : of all residuals in use; robust weights count as fractions of a datum.
+    chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : sum of squares and number
+        of residuals of edges, readings and nominal model.
+    steps : solver steps.
+    stopped : stopping reason, for people.
+    noise_scale : factor on the edges' stated standard deviations that makes them agree with the
+        residuals; 1 where their noise is not estimated.
+    chi2_poses, n_poses, pose_scale : the same of measured poses; a full pose has six residuals.
+    dof_edges, dof_joints, dof_poses : degrees of freedom of each kind of residual, tr(I - H); with
+        those of links and nominal model their sum is ``dof``.
+    shading : px, standard deviation of the common shift of all edges of one side of a tube at one
+        station.
     reading_scale : factor on the readings' stated noise, 1 where the data do not contradict it.
-    reading_range, pose_range : factors on the stated noise that the data allow, smallest and
-    largest, None for no end (:mod:`pkmcal.identify.noise`). look_scatter : what the result
-    scatters by with where edges were looked for, in the deviations that noise gives it; they
-    contain it. chi2_links, n_links, dof_links, link_scale, link_range : of measurements that link
-    two configurations, as those of poses.
+    reading_range, pose_range : confidence interval of the factors on the stated noise, None for no
+        upper bound (:mod:`pkmcal.identify.noise`).
+    look_scatter : scatter of the result with the prediction from which edges were measured,
+        relative to its standard deviations by noise; the covariance contains it.
+    chi2_links, n_links, dof_links, link_scale, link_range : the same of measurements that link two
+        configurations.
     """
 
     chi2: float
@@ -70,10 +75,10 @@ class Statistics:
 
     @property
     def chi2_as_stated(self) -> float:
-        """Chi-square per degree of freedom with the stated noise, NaN without degrees of freedom.
+        """Chi-square per degree of freedom at the stated noise, NaN without degrees of freedom.
 
-        With the estimated noise it is about 1 for any model, however wrong, for the factors on the
-        noise are chosen so.
+        At the estimated noise it is about 1 for any model, however wrong, because the factors on
+        the noise are estimated from it.
         """
         chi2 = self.chi2_edges * self.noise_scale**2 + self.chi2_poses * self.pose_scale**2
         chi2 += self.chi2_joints * self.reading_scale**2 + self.chi2_drawing
@@ -82,8 +87,8 @@ class Statistics:
 
 
 class Linearization(NamedTuple):
-    """The problem of an estimate with its final weights and noise, and its residuals and Jacobian
-    at the solution.
+    """Problem of an estimate with its final weights and noise, and its residuals and Jacobian at
+    the solution.
     """
 
     assembled: Assembled
@@ -97,26 +102,29 @@ class Linearization(NamedTuple):
 class Estimate:
     """Result of an estimate, in the frames that ``gauge`` names.
 
-    machine : with the identified values. state : all unknowns.
-    joint_covariance : (n, n) of the machine's parameters, the stations and the mounts together, in
-        that gauge, n = P + 6 S + 6 M; zero rows where fixed. Poses by (omega, tau), left
-        perturbation of T_camera_base and T_mount.
+    machine : machine with the identified values.
+    state : all unknowns.
+    joint_covariance : (n, n) of the machine's parameters, stations and mounts together, in the
+        gauge, n = P + 6 S + 6 M; zero rows where fixed. Poses by (omega, tau), left perturbation of
+        T_camera_base and T_mount.
     column_covariance : (n, n) of ``state.columns`` of each code.
-    edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1. edge_noise : of each
-    tube of a leg; edge_trust : (N,) by how much more or less than on average each edge counts for
-    its tails, see :mod:`pkmcal.identify.edge_noise`.
+    edge_residuals : (N, 2) whitened.
+    edge_weights : (N,) robust weights 0..1.
+    edge_noise : noise of the edges of each tube of a leg.
+    edge_trust : (N,) IRLS weight of each edge by the tails of its tube's noise, one on average
+        (:mod:`pkmcal.identify.edge_noise`).
     joint_residuals : (K, m) in standard deviations.
-    data_share : (P,) 1 - posterior variance / prior variance in the same gauge: near 1, the
-        data decide; near 0, the value is the nominal model's.
-    pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
-    link_residuals, link_weights : (N,) of measurements that link two configurations, those of one
-    kind after the other.
-    line_shading : (n,) px, standard deviation of each tube's side's shading at each station;
-        line_shift : (n,) px outward, what it came to, and line_shift_sigma : (n,) how well that is
-        known. Lines are numbered by :func:`~pkmcal.measurements.effects.lines`.
-    configurations : (K,) True where the configuration was seen and its pose estimated.
-    gauge : its name for people.
-    problem : the problem as assembled, with the stated noise and unit weights.
+    data_share : (P,) 1 - posterior variance / prior variance in the same gauge: near 1 the value is
+        determined by the data, near 0 by the nominal model.
+    pose_residuals, pose_weights : (N, 6) whitened, and (N,) robust weights, of the measured poses.
+    link_residuals, link_weights : (N,) of measurements that link two configurations, kind by kind.
+    line_shading : (n,) px, standard deviation of the shading of each side of a tube at each
+        station.
+    line_shift, line_shift_sigma : (n,) px outward, estimated shading and its standard deviation.
+        Lines are numbered by :func:`~pkmcal.measurements.effects.lines`.
+    configurations : (K,) True where the configuration has measurements and its pose was estimated.
+    gauge : name of the gauge, for people.
+    problem : problem as assembled, with the stated noise and unit weights.
     """
 
     machine: Machine
@@ -145,10 +153,10 @@ class Estimate:
 
     @cached_property
     def linearized(self) -> Linearization:
-        """The stored problem with this estimate's weights and noise, linearized at its state.
+        """Stored problem with this estimate's weights and noise, linearized at its state.
 
-        The lines' shading is zero in that state: a linear step covers it, as it covers whatever is
-        not at its minimum. Rows are evaluated when first used, and kept.
+        The lines' shading is zero in that state; like any other unknown that is not at its minimum,
+        it is corrected by a linear step. Rows are evaluated when first used, and cached.
         """
         statistics, problem = self.statistics, self.problem.problem
         edges = self.edge_noise.batch().applied(problem.blocks, problem.data)
@@ -167,8 +175,10 @@ class Estimate:
         return Linearization(assembled, Information(assembled.problem, start))
 
     def stated_edge_noise(self, measurements: Measurements) -> Measurements:
-        """Measurements of the estimate, all or some, with the estimated noise of readings and
-        edges; ``edge_trust`` is a further factor on the weight of each edge.
+        """Measurements with the estimated noise of readings and edges as their stated noise.
+
+        measurements : all or some of those of the estimate. ``edge_trust`` is a further factor on
+            the weight of each edge.
         """
         scale, edges = self.statistics.reading_scale, measurements.edges
         value = self.edge_noise
@@ -178,7 +188,9 @@ class Estimate:
         return replace(measurements, edges=edges, joint_noise=noise)
 
     def column_sigma(self, code: str) -> Array:
-        """Standard deviations (n,) of ``state.columns`` of a code; none where it has none."""
+        """Standard deviations (n,) of ``state.columns`` of a code; empty where the code has no
+        column.
+        """
         return np.sqrt(np.diag(self.column_covariance.get(code, np.zeros((0, 0)))))
 
     @property

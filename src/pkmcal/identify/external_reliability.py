@@ -1,17 +1,17 @@
-"""External reliability: covariance by wrong edges that no residual shows.
+"""External reliability: covariance due to wrong edges that no residual reveals.
 
-Some edges are not the leg's, but a highlight's, another leg's, or that of a cable behind it. A
-wrong edge that contradicts the others is rejected. Where few others constrain it, as in a hand-held
-image with a dozen edges and seven unknowns of its own, the unknowns follow the wrong edge, the next
-measurement pass finds it where they predict it, and no residual shows it. Its effect on the result
-is the external reliability (Baarda, A testing procedure for use in geodetic networks, 1968), which
-is here added to the covariance as a variance.
+Some edges belong to a highlight, another leg, or a cable behind the leg. A wrong edge that
+contradicts the others is rejected. Where few others constrain it, as in a hand-held image with a
+dozen edges and seven unknowns of its own, the unknowns follow the wrong edge, the next measurement
+pass finds it where they predict it, and no residual reveals it. The effect of such errors on the
+result is the external reliability (Baarda, A testing procedure for use in geodetic networks, 1968),
+which is here added to the covariance as a variance.
 
 An edge is wrong with probability p; its shift, and its tilt, are then off by a uniformly
 distributed number of its own standard deviations, up to ``most``. With H the hat matrix, the share
-r = 1 - H_ii of that error is left in the edge's own residual, which alone reveals it once the
-measurement passes have followed; so it is detected from ``NOTICED_DISTANCE / r`` on. Undetected
-errors have, on average, the square
+r = 1 - H_ii of that error remains in the edge's own residual. After repeated measurement passes no
+other residual contains it, so it is detected from ``NOTICED_DISTANCE / r`` on. Undetected errors
+have the mean square
 
     p u_i,      u = min(most, NOTICED_DISTANCE / r)^3 / (3 most).
 
@@ -21,9 +21,9 @@ their mean, p U with U = sum(r u) / sum(r), whichever edges are wrong. The rest 
     C J^T D J C,      D_ii = s_i (p u_i - min(p U, 1)),
 
 with J the rows of the edges, the own unknowns eliminated, C the inverse of the normal matrix, and
-s_i the ratio of an edge's own variance to that with which it enters among edges that are shaded in
-the same way. p is the share of rejected edges among those that would have been detected, with
-Jeffreys' prior for a share: half a wrong edge more, and half a right one.
+s_i the ratio of an edge's own variance to the variance that it has in the estimate, which counts
+the edges that share its shading. p is the share of rejected edges among detectable wrong and right
+ones, with Jeffreys' prior of a binomial share.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ LEAST_REDUNDANCY = 1e-3
 
 
 def covariance_of_undetected(info: Information, weight: Array) -> Array:
-    """Covariance (B, na, na) of the shared unknowns that undetected wrong edges add at a solution;
+    """Covariance (B, na, na) of the shared unknowns due to undetected wrong edges at a solution;
     zero where no edge has shading.
 
-    weight : (B, K, G) of edges, 0..1, without their IRLS weight; the difference to 1 is rejected.
+    weight : (B, K, G) robust weights 0..1 of the edges, without their IRLS weight.
     """
     half, blocks = info.root, info.problem.blocks
     n_runs, na = half.shape[:2]
@@ -109,8 +109,8 @@ def _deviations(piece: ReducedEdges) -> tuple[Array, Array]:
     1, N, r) each, shift and tilt in turns.
 
     Errors are 0 for edges that are not in use, or have no shading. The tilt's largest error follows
-    from points evenly along the edge: the line is root three times less certain at its ends than in
-    its middle.
+    from points evenly distributed along the edge: the standard deviation of the line at its ends is
+    sqrt(3) times that in its middle.
     """
     blocks, data = piece.problem.blocks, piece.problem.data
     size = np.where(data.weight > 0, shift_squares(blocks, data), 0.0)

@@ -1,9 +1,9 @@
-"""False-alarm level of a session, shared by everything that is searched for in its data.
+"""False-alarm level of a session, shared by all significance tests on its data.
 
-A session makes several searches, each of several tests. By Bonferroni's inequality, the chance that
-any test of a session that agrees with its model is significant is at most the level, if each search
-has an equal share of the level, and each test of a search an equal share of that. The inequality
-holds however the tests depend on each other.
+A session makes several searches, each of several tests. By Bonferroni's inequality, the probability
+that any test is significant although the session agrees with its model is at most the level, if
+each search has an equal share of the level, and each of its tests an equal share of that. The
+inequality holds however the tests depend on each other.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ EQUAL_SHARES = MappingProxyType(dict.fromkeys(Search, 1 / len(Search)))
 class FalseAlarm:
     """Level of a session, and the searches that share it."""
 
-    # chance that a session that agrees with its model shows any named violation, any discrepancy,
-    # or any measured pose that disagrees with all others: one session of two hundred
+    # probability of any significant test (violation, discrepancy, outlier) in a session that agrees
+    # with its model: one session of two hundred
     level: float = 0.005
     # share of the level that each search has
     shares: Mapping[Search, float] = field(default_factory=lambda: EQUAL_SHARES)
@@ -47,8 +47,8 @@ class FalseAlarm:
         return self.level * self.shares[search] / max(tests, 1)
 
     def scale(self, search: Search, dof: float) -> float:
-        """Root mean square of normal errors, in their standard deviations, that one search exceeds
-        by chance at its level.
+        """Threshold of the root mean square of ``dof`` normal errors, in standard deviations, at
+        the level of one search.
         """
         from scipy.special import chdtri
 
@@ -58,8 +58,10 @@ class FalseAlarm:
     def adjusted(
         self, search: Search, chance: Array | float, tests: Array | Integers | int
     ) -> Array:
-        """P-values among all tests of a session, from the p-values of tests and the number of tests
-        that share the level of their search.
+        """P-values adjusted for all tests of a session.
+
+        chance : p-values of the tests. tests : number of tests that share the level of their
+            search.
         """
         return np.minimum(np.asarray(tests) * chance / self.shares[search], 1.0)
 

@@ -48,8 +48,8 @@ class Gauge(Protocol):
 
 
 FRAME_CHANGE_ROUNDING = 1e-12
-"""Value, relative to the machine's size or to 1 for directions, below which it is rounding of a
-change of frames: some thousand times that of a double."""
+"""Value after a change of frames that is rounding, relative to the machine's size, or to 1 for
+directions: some thousand times the rounding of a double."""
 COLLINEAR_POINTS_SINE = 1e-3
 """Distance of three points from one line, relative to their distances, below which they determine
 no rotation about it."""
@@ -247,8 +247,9 @@ def turned_back(layout: LimbLayout, y: Array) -> Array:
 def freedoms(machine: Machine) -> Array:
     """Basis (12, g) of the frame changes that the machine's model allows, at the nominal values.
 
-    All twelve for a spatial machine without fixed parameters. Fixed or tied parameters remove some;
-    a machine that moves in fewer directions keeps those that preserve its motion.
+    All twelve for a spatial machine without fixed parameters. Fixed or tied parameters remove some.
+    A machine with fewer than six degrees of freedom has only the frame changes that preserve its
+    motion.
     """
     shifted = generators(machine.layout, machine.parameters.nominal)
     return _allowed(machine, shifted, respecting_motion(machine.layout.motion))
@@ -256,7 +257,7 @@ def freedoms(machine: Machine) -> Array:
 
 def conventions(machine: Machine) -> Array:
     """Basis (12 + n, g) of the frame and hinge changes that the machine's model allows, at the
-    nominal values: parameters of choice, which no data can determine.
+    nominal values: the directions of the parameters that are conventions, which no data determine.
     """
     frames = freedoms(machine)
     return _with_hinges(machine, frames, 2 * machine.layout.n_internal)
@@ -295,7 +296,9 @@ def _allowed(machine: Machine, shifted: Array, candidates: Array) -> Array:
 
 
 def respecting_motion(motion: Array) -> Array:
-    """Frame changes (12, g) after which the platform still moves along ``motion`` (6, m)."""
+    """Basis (12, g) of the frame changes after which the platform still moves along ``motion`` (6,
+    m).
+    """
     if motion.shape[1] == 6:
         return np.eye(12)
     both = np.concatenate([np.eye(6), np.eye(6)])
@@ -370,7 +373,7 @@ def alignment(machine: Machine, state: State, gauge: Gauge) -> tuple[Array, Arra
 
 
 def in_gauge(machine: Machine, state: State, gauge: Gauge) -> State:
-    """The same machine, stations and poses in the frames of the gauge; no residual changes.
+    """State in the frames of the gauge; no residual changes.
 
     Values that the gauge makes zero are set to zero, without rounding.
     """

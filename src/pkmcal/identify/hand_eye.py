@@ -46,7 +46,7 @@ DRAWN_POSE_SHIFT_SHARE = 0.02
 """Standard deviation of their positions, relative to the limbs' length: 10 mm of half a metre."""
 HAND_EYE_ROUNDS = 4
 UNKNOWN_CAMERA_TURN = 0.3
-"""Standard deviation (rad) of the camera's rotation above which it is unidentifiable."""
+"""Standard deviation (rad) of the camera's rotation above which the rotation is unidentifiable."""
 LEAST_PAIR_CONFIGURATIONS = 3
 """Configurations in which a station must see a mount."""
 HAND_EYE_RANKS = (1, 2, 4)
@@ -61,9 +61,13 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class PairProblem:
-    """solver.LeastSquares of B runs: ``observed = T_camera_base body T_mount``, K poses each.
+    """Least-squares problem of B runs: ``observed = T_camera_base body T_mount``, K poses each.
 
-    body, observed : (B, K, 4, 4). weight : (B, K). turn, shift : standard deviations, rad and m.
+    Implements :class:`pkmcal.solver.search.LeastSquares`.
+
+    body, observed : (B, K, 4, 4).
+    weight : (B, K).
+    turn, shift : standard deviations of a pose, rad and m.
     size : prior sigma of the mount's position about zero, m.
     """
 
@@ -121,7 +125,7 @@ class PairProblem:
         return replace(self, body=parts[0], observed=parts[1], weight=parts[2])
 
 
-def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
+def solve_pairs(body: Array, observed: Array, size: float) -> Pair:
     """Camera and mount of B runs from the platform's poses and the board's, (B, K, 4, 4) each.
 
     size : the limbs' length, m. Starts in closed form, then iteratively reweighted least squares
@@ -129,13 +133,13 @@ def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     poses do not determine the camera's rotation.
     """
     # all starts of all runs as one batch
-    starts = closed_forms(body, visibility)
+    starts = closed_forms(body, observed)
     n, runs = len(starts), len(body)
     every = Pair(*(np.concatenate(parts) for parts in zip(*starts, strict=True)))
-    body, visibility = (np.concatenate([part] * n) for part in (body, visibility))
+    body, observed = (np.concatenate([part] * n) for part in (body, observed))
     problem = PairProblem(
         body,
-        visibility,
+        observed,
         np.ones(body.shape[:2]),
         DRAWN_POSE_TURN_SIGMA,
         DRAWN_POSE_SHIFT_SHARE * size,
@@ -155,11 +159,11 @@ def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     return pair
 
 
-def closed_forms(body: Array, visibility: Array) -> list[Pair]:
-    """Starts for :func:`solve_pairs`, each of B runs: one for every way in which the platform's
-    turns may leave the rotations open.
+def closed_forms(body: Array, observed: Array) -> list[Pair]:
+    """Starts for :func:`solve_pairs`, each of B runs: one for each number of rotations
+    (HAND_EYE_RANKS) that the platform's rotations may leave undetermined.
     """
-    return [_placed(body, visibility, *turns) for turns in _turns(body, visibility)]
+    return [_placed(body, observed, *turns) for turns in _turns(body, observed)]
 
 
 def _check_identifiable(problem: PairProblem, pair: Pair) -> None:
@@ -178,7 +182,7 @@ def _check_identifiable(problem: PairProblem, pair: Pair) -> None:
         )
 
 
-def _turns(body: Array, visibility: Array) -> list[tuple[Array, Array]]:
+def _turns(body: Array, observed: Array) -> list[tuple[Array, Array]]:
     """Candidate rotations of camera and mount, (B, 3, 3) each.
 
     ``q_measured = q_camera q_body q_mount`` is linear in either unknown, so the sum over the poses
@@ -186,7 +190,7 @@ def _turns(body: Array, visibility: Array) -> list[tuple[Array, Array]]:
     turns about one axis, all four where it does not turn; in the space of equal values the rotation
     nearest to the one that aligns the positions is chosen.
     """
-    q_body, q_measured = (quaternion(poses[..., :3, :3]) for poses in (body, visibility))
+    q_body, q_measured = (quaternion(poses[..., :3, :3]) for poses in (body, observed))
     # signs from the rotations since the first pose, which both sides share
     sign = np.sign(dot(q_body, q_body[:, :1]) * dot(q_measured, q_measured[:, :1]))
     sign = np.where(sign == 0, 1.0, sign)
@@ -194,7 +198,7 @@ def _turns(body: Array, visibility: Array) -> list[tuple[Array, Array]]:
     conjugate = np.diag([1.0, -1.0, -1.0, -1.0])
     each = _left_product(q_measured) @ _right(q_body @ conjugate) @ conjugate
     u, _, vt = np.linalg.svd(np.sum(sign[..., None, None] * each, axis=1))
-    laid = quaternion(register(body[..., :3, 3], visibility[..., :3, 3])[..., :3, :3])
+    laid = quaternion(register(body[..., :3, 3], observed[..., :3, 3])[..., :3, :3])
     along = u.mT @ laid[..., None]
     out: list[tuple[Array, Array]] = []
     for rank in HAND_EYE_RANKS:
@@ -219,14 +223,14 @@ def _right(q: Array) -> Array:
     return out
 
 
-def _placed(body: Array, visibility: Array, camera: Array, mount: Array) -> Pair:
+def _placed(body: Array, observed: Array, camera: Array, mount: Array) -> Pair:
     """Pair with least-squares positions for known rotations.
 
     ``t_observed = R_camera (R_body t_mount + t_body) + t_camera`` is linear; t_mount has a prior at
     zero with the limbs' length.
     """
     rot = camera[:, None] @ body[..., :3, :3]
-    right = visibility[..., :3, 3] - (camera[:, None] @ body[..., :3, 3:])[..., 0]
+    right = observed[..., :3, 3] - (camera[:, None] @ body[..., :3, 3:])[..., 0]
     off_rot = (rot - rot.mean(axis=1, keepdims=True)).reshape(len(body), -1, 3)
     off = (right - right.mean(axis=1, keepdims=True)).reshape(len(body), -1, 1)
     normal = off_rot.mT @ off_rot + DRAWN_POSE_SHIFT_SHARE**2 * np.eye(3)
@@ -276,9 +280,9 @@ def _carried_on(
 ) -> tuple[Array, Array]:
     """Poses of stations (S, 4, 4) and mounts (M, 4, 4), NaN where undetermined.
 
-    Known poses are propagated to stations and mounts that share a measured pose with them; when
-    this ends, the station and mount with the most common poses are solved. poses : T_base_platform
-    (K, 4, 4), NaN where unknown.
+    Known poses are propagated to stations and mounts that share a measured pose with them. When no
+    pose can be propagated, the pair of station and mount with the most common poses is solved by
+    :func:`solve_pairs`. poses : T_base_platform (K, 4, 4), NaN where unknown.
     """
     in_view, on_platform = measurements.poses, measurements.on_platform
     stations, mounts = stations.copy(), np.full((len(on_platform), 4, 4), np.nan)

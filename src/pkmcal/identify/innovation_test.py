@@ -1,17 +1,18 @@
 """Innovation test: whether a rejected pose agrees with the estimate from the other measurements.
 
-The configuration of a pose without weight follows the readings, and the pose differs from the
-prediction by the errors of the readings. Where readings are coarse that is many standard deviations
-of the pose's own noise, though the pose is right; once rejected, because the readings' noise was
-stated too small or on the way to the solution, such a pose would stay rejected. So a rejected pose
-is tested by its innovation. With A the rows that the pose would have, unweighted, r their
-residuals, and C the covariance of all unknowns from the other measurements and the prior,
+The configuration of a pose without weight follows the readings, and the pose differs from its
+prediction by the errors of the readings. Where readings are coarse, this difference is many
+standard deviations of the pose's own noise, although the pose is right. A pose that was rejected
+before the solution was reached, or because the readings' noise was stated too small, would then
+stay rejected. So a rejected pose is tested by its innovation. With A the unweighted rows of the
+pose, r their residuals, and C the covariance of all unknowns from the other measurements and the
+prior,
 
     d^2 = r^T (s^2 I + A C A^T)^-1 r,      s the noise scale of the poses.
 
 C covers a configuration's own unknowns and the shared ones. With Q R the Jacobian by the own
-unknowns, W = Q^T J the part of the shared ones' Jacobian J in its range, and F F^T the covariance
-of the shared unknowns,
+unknowns, W = Q^T J with J the Jacobian by the shared unknowns, and F F^T the covariance of the
+shared unknowns,
 
     A C A^T = A_own R^-1 R^-T A_own^T + G F F^T G^T,      G = A_shared - A_own R^-1 W.
 """
@@ -29,7 +30,8 @@ from pkmcal.solver.strips import eliminate_strips
 
 
 def innovations(info: Information, distance: Array, weight: Array, scale: Array) -> Array:
-    """Norms (B, K, G) of the poses; of rejected ones relative to their innovations.
+    """Norms (B, K, G) of the poses; those of rejected poses relative to the covariance of their
+    innovations.
 
     All norms are converted to those of pairs of numbers (:func:`~pkmcal.identify.robust.as_pairs`).
 

@@ -1,7 +1,7 @@
 """Rows of measurements that link two configurations (:mod:`pkmcal.measurements.links`).
 
-A link's row stands among those of its second configuration. It depends on shared unknowns only: the
-own unknowns of both configurations, which are shared, and the mount.
+The row of a link is among those of its second configuration. It depends on shared unknowns only:
+the own unknowns of both configurations, which are shared, and the mount.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from pkmcal.measurements import LinkRows, LinkSet
 
 @dataclass(frozen=True)
 class LinkBlocks:
-    """Places of the links: K configurations of G rows, padded; the same for all runs.
+    """Positions of the links: K configurations of G rows, padded; the same for all runs.
 
-    sets : links by kind, N together, whose ``configuration`` counts linked configurations, from 0.
-    linked : (J,) the linked ones among all configurations.
+    sets : N links by kind, whose ``configuration`` counts linked configurations, from 0.
+    linked : (J,) linked configurations, by their number among all.
     number : (K,) number of each configuration among the linked ones, -1 for none.
-    at : places of the links.
+    at : positions of the links.
     """
 
     sets: tuple[LinkSet, ...]

@@ -32,10 +32,11 @@ class MeasuredPlatform(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """Pose split into the part that the machine can take and the deviations.
+    """Pose split into a pose that the machine can take, and the deviations from it.
 
-    pose : (..., 4, 4). off : (..., 6 - d) deviations. by, off_by : (..., 6, 6) and (..., 6 - d, 6)
-    derivatives of both by the whole pose.
+    pose : (..., 4, 4).
+    off : (..., 6 - d) deviations.
+    by, off_by : (..., 6, 6) and (..., 6 - d, 6), derivatives of both by the whole pose.
     """
 
     pose: Array

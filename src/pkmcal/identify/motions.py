@@ -1,12 +1,11 @@
-"""Named motions of a machine: candidates for the directions that data leave unidentified.
+"""Named motions of a machine: candidates for the null space of the data.
 
 A motion is a set of changes with one name and one sentence: its columns are changes of all P
 parameters in their own units (m, rad, or parts of a unit axis). Motions come from the parameter
 table (a parameter of one leg, the same parameter of all legs, parameters that all legs have in
-common), from frames (single legs, groups of legs and whole bodies moved as rigid bodies), from a
-leg's appearance along itself, and from the carriers' own files: no joint kind is named here.
-
-:mod:`pkmcal.identify.unidentified` finds the motions that the data do not determine.
+common), from frames (single legs, groups of legs and whole bodies moved as rigid bodies), from
+slides of a leg along itself, and from the carriers' own files, so no kind of joint is named here.
+:mod:`pkmcal.identify.unidentified` selects the motions that the data do not determine.
 """
 
 from __future__ import annotations
@@ -48,26 +47,27 @@ Advice = Literal[
 
 @dataclass(frozen=True)
 class UnidentifiedOptions:
-    """Constants of the sentences on what the data do not determine. All but ``weak`` only choose
-    names: no verdict depends on them.
+    """Constants of the sentences on undetermined directions. All but ``weak`` only affect their
+    wording; no verdict depends on them.
     """
 
-    # shares of a motion (squared) that lie in the open space for it to explain part of that space:
-    # first those that fit exactly, since many motions are similar once frames are removed, then
-    # those that fit nearly. The space is that of the estimate, whose noise of poses bends
-    # directions that would be exact
+    # squared cosines between a motion and the undetermined space above which the motion explains
+    # a part of that space. The larger one is applied first, since many motions are similar once
+    # frames are removed; the smaller one allows for the noise of the poses at which the space was
+    # evaluated
     inside: tuple[float, float] = (0.999, 0.95)
-    # information, in units of the prior's, below which a direction counts as unidentified: the data
-    # then decide less than a tenth of its variance. Platforms that only translate seem to rotate by
-    # their poses' noise, so unidentifiable directions have a trace of information
+    # information in units of the prior (singular value) below which a direction counts as
+    # unidentified: the data then reduce its variance by less than a tenth. Estimated poses of a
+    # translational platform contain small rotations by noise, so unidentifiable directions have
+    # some spurious information
     weak: float = 1 / 3
-    # reweighting steps to the sparsest coefficients, and how much less those of frames cost, which
-    # no sentence contains
+    # reweighting steps to the sparsest coefficients, and weight of the frames' coefficients, which
+    # are not part of a sentence and so need not be sparse
     sparse_steps: int = 20
     frame_weight: float = 10.0
 
-    # sine of the angle to the motions so far below which a motion describes nothing new. What no
-    # motion describes is reported in one sentence, so larger angles must count
+    # sine of the angle to the previous motions below which a motion describes nothing new. The
+    # undescribed rest is reported in one sentence, so larger angles must count
     new_sine: float = 0.1
 
 
@@ -150,22 +150,23 @@ How = Callable[[Situation, Array], str]
 class NamedChanges:
     """Changes of the parameters with one name.
 
-    legs : that the changes concern, from 0.
+    legs : legs that the changes concern, from 0.
     columns : (P, m).
     one, several : sentence for one leg, and for several legs, without a full stop, with the fields
 
     - ``{legs}``: leg 3; legs 1 to 4. ``{each}``: "each of ", before several legs.
     - ``{is}``, ``{are}``, ``{open}``: is free, are free, free; or known from the nominal model
       only. ``{better}``, ``{limited}``: the same as an end of the sentence, empty where it is free.
-    - ``{n}``: number of independent changes of a leg. ``{combinations}``: that so many are open.
-      ``{ways}``: in how many ways.
+    - ``{n}``: number of independent changes of a leg. ``{combinations}``: number of undetermined
+      combinations. ``{ways}``: number of independent changes, in words.
     - ``{mostly}``: terms of a single change, or the parameters that change most.
     - ``{how}``: result of ``how`` for the motion's coefficients.
 
-    how : makes words from the coefficients.
+    how : function from the coefficients (k, m) to words.
     labels : names and units of the columns, where ``{mostly}`` lists these instead of parameters.
     advice : kind of advice.
-    convention : a change of the description, not of a leg; other motions are searched without it.
+    convention : whether the change affects only the description of the machine, as frames do; other
+        motions are searched without it.
     """
 
     legs: tuple[int, ...]
@@ -276,6 +277,7 @@ def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
     """Motions of one leg: axes, radii, the leg along itself, then each parameter and each point
     alone.
     """
+    # both axes rotated together
     base, platform = s.fields[leg].get("base.axis"), s.fields[leg].get("platform.axis")
     if base is not None and platform is not None:
         values, rot = s.machine.values, s.T_base_platform[0, :3, :3]
@@ -291,6 +293,7 @@ def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
     what = {field: s.label(rows) for field, rows in s.fields[leg].items()}
     axes = [field for field in alone if field.endswith("axis")]
     points = [f for f, own in alone.items() if own.shape[1] == 3 and f not in (*axes, "tubes")]
+    # each axis, the tubes' radii, the leg along itself
     for field in axes:
         one = f"the direction of the {what[field]} of {{each}}{{legs}} {{is}}"
         yield NamedChanges((leg,), alone[field], one, advice="turn")
@@ -298,6 +301,7 @@ def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
         one = "the tubes' radii of {legs} {are}"
         yield NamedChanges((leg,), alone["tubes"], one, advice="caliper")
     yield _along(s, leg)
+    # each other parameter, and each point, alone
     for field in (f for f in alone if f not in (*axes, *points, "tubes")):
         yield NamedChanges((leg,), alone[field], f"the {what[field]} of {{each}}{{legs}} {{is}}")
     for field in points:
@@ -645,9 +649,11 @@ def _line(
 
 
 def _spread(s: Situation, legs: tuple[int, ...]) -> NamedChanges:
-    """Legs move apart in their present shape while their tubes grow by the same ratio, (P, 1).
+    """Change (P, 1) that moves legs apart in their present shape and scales their tubes' radii
+    alike.
 
-    The images are the same if the platform does not rotate: the change is one of all depths.
+    All depths change by the same ratio, so the images stay the same if the platform does not
+    rotate.
     """
     values, (base, platform) = s.machine.values, centre_index(s.machine.layout)
     centres = values[base[list(legs)]]

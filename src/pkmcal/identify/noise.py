@@ -50,23 +50,23 @@ class NoiseOptions:
     contradiction_chance: float = 0.01 / 3
     # largest factor on a noise in one step, beyond which the linear model no longer holds
     largest_step: float = 10.0
-    # rows whose residuals are made independent together. If there are more, they are handled in
-    # groups of configurations: each has its exact variance, but the correlation between groups, by
-    # the few shared unknowns, is neglected
+    # largest number of rows whose residuals are decorrelated together. More rows are handled in
+    # groups of configurations: variances remain exact, but correlations between groups, which are
+    # due to the few shared unknowns, are neglected
     largest_group: int = 400
     # eigenvalue of M below which it is rounding: the unknowns absorb the whole direction
     rounding: float = 1e-10
-    # logarithms of s^2 that are tried, from minus this one, which stands for zero, and their number
+    # grid of log s^2: its end to either side (the lower one stands for zero), and number of values
     largest_log_variance: float = 20.0
     variances: int = 41
-    # the same of t^2, which are tried first for each s^2, and the steps that refine the best
+    # grid of log t^2 for each s^2, and the steps that refine its best value
     largest_log_others: float = 14.0
     others: int = 15
     others_steps: tuple[float, ...] = (1.0, 0.25, 0.0625)
     # bisections of an interval of log s^2
     halvings: int = 8
-    # of which so many are evaluated together: the likelihood of fifteen points takes hardly longer
-    # than that of one
+    # bisections whose points are evaluated together: the likelihood of fifteen points takes hardly
+    # longer than that of one
     halvings_at_once: int = 4
 
     @property
@@ -89,7 +89,7 @@ class Components:
     """Residuals of each kind of rows in B solutions.
 
     chi2 : (B, 4) sums of squared residuals.
-    freedom : (B, 4) tr R_kk, their expectation at the stated noise.
+    freedom : (B, 4) tr R_kk, expectation of ``chi2`` at the stated noise.
     """
 
     chi2: Array
@@ -136,14 +136,16 @@ class NoiseShares:
 
     @property
     def best(self) -> Array:
-        """Factor s (B,) of the highest likelihood, 0 where that is at the smallest value tried."""
+        """Factor s (B,) of the highest likelihood, 0 where that is the smallest value of the
+        grid.
+        """
         return np.sqrt(self._best[0])
 
     def factor(self) -> Array:
         """Factor (B,) on the kind's noise for the next step.
 
-        Where the data allow the present noise and any smaller one, it stays: they contain no better
-        value, and a noise of zero would promise too much.
+        1 where the data allow the present noise and any smaller one: they then contain no estimate,
+        and a noise of zero would give too small standard deviations.
         """
         low, high = self.interval()
         most = self.options.largest_step
@@ -157,11 +159,13 @@ class NoiseShares:
         return self._freedom((s**2)[:, None])[:, 0]
 
     def interval(self, chance: float | None = None) -> tuple[Array, Array]:
-        """Smallest and largest factor (B,) on the kind's noise that the data allow at the level 1 -
-        ``chance``, by default that of a contradiction; 0 and infinity where there is no bound.
+        """Confidence interval of the factor (B,) on the kind's noise, by the likelihood ratio.
 
-        By the likelihood ratio. The lower end is 0 where too few residuals determine the best
-        factor, and the upper end is at least the factor that enough residuals would determine.
+        chance : 1 - confidence level, by default ``contradiction_chance``.
+
+        Bounds are 0 and infinity where there is none. The lower bound is 0 where fewer than
+        LEAST_NOISE_FREEDOM residuals determine the best factor, and the upper bound is at least the
+        smallest factor that this number of residuals would determine.
         """
         chance = self.options.contradiction_chance if chance is None else chance
         if chance not in self._intervals:
@@ -190,7 +194,7 @@ class NoiseShares:
         inside = self._grid <= level[:, None]
         with np.errstate(divide="ignore"):
             middle = np.clip(np.log(best), tried[0], tried[-1])
-        # from the outermost value tried that is allowed, or the best one, to the next value beyond
+        # brackets of both bounds: outermost grid value inside the interval, and its neighbour
         a = np.minimum(np.where(inside, tried, np.inf).min(axis=1), middle)
         b = np.maximum(np.where(inside, tried, -np.inf).max(axis=1), middle)
         before = tried[np.maximum(np.searchsorted(tried, a) - 1, 0)]

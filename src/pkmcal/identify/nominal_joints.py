@@ -18,11 +18,16 @@ PLANAR_REVOLUTE_AXIS = np.array([0.0, 0.0, 1.0])
 class NominalJoints:
     """Joints of a machine's nominal model, m; each body in its own frame.
 
-    base, platform : (L, 3) centres. base_axes, platform_axes : (L, 3) unit, NaN without an axis.
+    base, platform : (L, 3) centres.
+    base_axes, platform_axes : (L, 3) unit, NaN without an axis.
     base_revolute, platform_revolute : (L,) legs that are perpendicular to an axis on that body, [A]
-    7. torsion : (L,) legs that cannot twist, with an axis on each body. rod : (L,) offsets and
-    constant lengths. closing : (L,) legs with a length. constant : (L,) legs of constant length.
-    planar : all axes are the plane's normal. motion : (6, d) of the platform.
+        7.
+    torsion : (L,) legs that cannot twist, with an axis on each body.
+    rod : (L,) offsets and constant lengths.
+    closing : (L,) legs with a length.
+    constant : (L,) legs of constant length.
+    planar : all axes are the plane's normal.
+    motion : (6, d) of the platform.
     """
 
     base: Array

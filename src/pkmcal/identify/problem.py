@@ -100,18 +100,24 @@ class _Evaluated(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """The joint estimation of B runs; a :class:`~pkmcal.solver.search.Divisible`.
+    """Joint estimation of B runs as a least-squares problem; a
+    :class:`~pkmcal.solver.search.Divisible`.
 
-    layout, nominal (P,) nominal values, free (P, nz) : the machine. unknowns : and their
-    columns.
-    blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.
-    prior : (c, na) rows on the shared unknowns and prior_target : (c,). frames : (12 + n, g)
-    changes of frames and of the hinges' origins that no measurement determines. pose_blocks,
-    pose_data : of boards. link_blocks, link_data : of links. reading_columns : effects on the
-    readings. slopes : (B, K, E) closures by their readings, which tell their noise, where they are
-    held; None where they are the state's own. structure_cache : the :attr:`structure`, which
-    problems of the same measurements share. rows_at_once : of the configurations that are
-    linearized together.
+    layout : limbs of the machine.
+    nominal, free : (P,) nominal parameters, and (P, nz) their derivative by the free unknowns z.
+    unknowns : numbers and columns of the shared unknowns.
+    blocks, data : edges and readings.
+    joint_noise : (B or 1,) standard deviation of a reading.
+    prior, prior_target : (c, na) rows on the shared unknowns, and (c,) their targets.
+    frames : (12 + n, g) changes of frames and of the hinges' origins that no measurement
+        determines.
+    pose_blocks, pose_data : measured poses.
+    link_blocks, link_data : links.
+    reading_columns : effects on the readings.
+    slopes : (B, K, E) derivatives of the closures by their readings, which give the closures their
+        noise, where these are fixed; None to evaluate them at the state.
+    structure_cache : :attr:`structure`, shared by problems of the same measurements.
+    rows_at_once : number of rows that are linearized together, in whole configurations.
     """
 
     layout: LimbLayout
@@ -135,7 +141,7 @@ class Problem:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Keep the structure of a problem of the same measurements."""
+        """Reuse the structure of a problem of the same measurements."""
         parts = (
             self.layout, self.nominal, self.free, self.unknowns, self.blocks, self.frames,
             self.link_blocks,
@@ -169,7 +175,7 @@ class Problem:
         return slice(n_edge_rows, n_edge_rows + self.layout.n_equations)
 
     def select(self, runs: Integers) -> Problem:
-        """The problem of some runs."""
+        """Problem of some runs."""
         return replace(
             self,
             data=of_runs(self.data, runs),
@@ -180,7 +186,7 @@ class Problem:
         )
 
     def among(self, configurations: slice) -> Problem:
-        """The problem of some configurations; of all it is ``self``, with its cache."""
+        """Problem of some configurations; ``self``, with its cache, for all."""
         if configurations == slice(0, len(self.blocks.present)):
             return self
         structure = self.structure.among(configurations)
@@ -213,7 +219,7 @@ class Problem:
         return state.T_base_platform[:, self.link_blocks.linked]
 
     def weighted(self, weight: RowGroups[Array]) -> Problem:
-        """The problem with other weights (B, K, G) of the measurements of each kind."""
+        """Problem with other weights (B, K, G) of the measurements of each kind."""
         return replace(
             self,
             data=replace(self.data, weight=weight.edges),
@@ -222,18 +228,19 @@ class Problem:
         )
 
     def as_noisy_as_at(self, state: BatchState) -> Problem:
-        """The problem with the closures' noise fixed to that at the start of a search.
+        """Problem with the closures' noise fixed to its value at a state, the start of a search.
 
         The derivative of a crank's closure by its reading depends on the state. If the noise
-        followed the state, the cost would have a gradient that no row contains, that of the noise,
-        and with thousands of configurations no step near the minimum would reduce it as predicted.
+        followed the state, the gradient of the cost would contain that of the noise, which no row
+        contains, and with thousands of configurations no step near the minimum would reduce the
+        cost as predicted.
         """
         if self.layout.reads_lengths:
             return self
         return replace(self, slopes=self.closure(state).by_reading)
 
     def shaded(self, sigma: Array) -> Problem:
-        """The problem with other standard deviations (B, n) px of the lines' shading."""
+        """Problem with other standard deviations (B, n) px of the lines' shading."""
         unit = np.repeat(self.data.unit, max(len(sigma) // len(self.data.unit), 1), axis=0)
         unit[:, self._lines] = sigma
         return replace(self, data=replace(self.data, unit=unit))
@@ -244,7 +251,7 @@ class Problem:
         return self.data.unit[:, self._lines]
 
     def lines_of(self, state: BatchState) -> Array:
-        """Shifts (B, n) of the lines, in their standard deviations."""
+        """Shifts (B, n) of the lines, in their prior standard deviations."""
         return state.columns[:, self._lines]
 
     @property
@@ -254,15 +261,15 @@ class Problem:
         return slice(lines.start - first, lines.stop - first)
 
     def with_shading_units(self, state: BatchState, sigma: Array) -> BatchState:
-        """The state in the units of other standard deviations (B, n) px of the lines' shading."""
+        """State in the units of other standard deviations (B, n) px of the lines' shading."""
         columns = state.columns.copy()
         columns[:, self._lines] *= self.shading / sigma
         return replace(state, columns=columns)
 
     def opened(self, state: BatchState) -> tuple[Problem, BatchState]:
-        """The problem and state with every parameter of the machine as an unknown.
+        """Problem and state with every parameter of the machine as an unknown.
 
-        For derivatives by parameters that are fixed; z is then ``theta - nominal``.
+        For derivatives by fixed parameters; z is then ``theta - nominal``.
         """
         n, machine = self.nominal.size, self.unknowns.machine
         prior = [self.prior[:, machine] @ self.structure.to_free, self.prior[:, machine.stop :]]
@@ -279,7 +286,7 @@ class Problem:
         return self.nominal + state.z @ self.free.T
 
     def closure(self, state: BatchState) -> Closure:
-        """The closure of all runs and configurations, (B, K, E)."""
+        """Closures of all runs and configurations, (B, K, E)."""
         theta = self.theta(state)[:, None, :]
         internal = state.internal if self.layout.n_internal else None
         joints = self.reading_columns.corrected(self.data.joints, state.columns)
@@ -291,7 +298,7 @@ class Problem:
         return Values(evaluated.value, evaluated.shared_value, partial(self._rows, evaluated))
 
     def linearize(self, state: BatchState) -> Linear:
-        """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
+        """Residuals and exact Jacobian; zero for padding and where nothing can be predicted."""
         return self.compact(state).linear()
 
     def compact(self, state: BatchState) -> Compact:
@@ -315,6 +322,7 @@ class Problem:
     def _rows(self, evaluated: _Evaluated) -> Compact:
         """The rows at a state, from its residuals."""
         usable = np.isfinite(evaluated.value) & self._in_use
+        # derivatives of closures, boards and links by shared and own unknowns
         by_closures, by_pose = self._of_closures(evaluated.closure)
         by_boards, by_board = self._of_boards(evaluated.poses)
         by_links = self._of_links(evaluated.links)
@@ -322,11 +330,13 @@ class Problem:
         by_own = np.concatenate([by_pose, by_board, no_own], axis=2)
         by_own = np.where(np.isfinite(by_own.sum(axis=-1, keepdims=True)), by_own, 0.0)
         rest = self._of_rest(by_closures, np.concatenate([by_boards, by_links], axis=2))
+        # effects that change readings act through the closures
         if len(self.reading_columns.column):
             by_readings = self.by_readings(evaluated.closure, self.reading_columns.by)
             columns = self.unknowns.effects.start + self.reading_columns.column
             equations = np.arange(by_readings.shape[2])[:, None]
             rest[:, :, equations, columns] += np.nan_to_num(by_readings)
+        # own unknowns of linked configurations are shared columns
         for k, columns in zip(*self.structure.strips.linked_places, strict=True):
             rest[:, k, :, columns] += np.moveaxis(by_own[:, k], -1, 0)
             by_own[:, k] = 0.0
@@ -341,10 +351,12 @@ class Problem:
         )
 
     def _of_edges(self, edges: EdgeRows, value: Array) -> Array:
-        """Numbers of the strips (B, d + w + 1, N, n) from the residuals (B, N, n) of the views' n
-        rows: derivatives by own unknowns and by the structure's ``strip_parameters``, and the
-        residuals. Zero where they are not finite.
+        """Numbers of the strips, (B, d + w + 1, N, n).
+
+        Derivatives by the d own unknowns and by the w ``strip_parameters`` of the structure, and
+        the residuals; zero where they are not finite. value : (B, N, n) residuals of the N views.
         """
+        # derivatives by own unknowns, both ends, station, radii and effects, written in place
         by_columns, ends_by = edges.data.by_columns, edges.ends_by(self.layout.freedoms)
         tube = self.structure.own_radii
         widths = (ends_by.shape[-1], len(tube), len(by_columns), 1)
@@ -361,6 +373,7 @@ class Problem:
         lost = ~np.isfinite(value)
         if lost.any():
             np.copyto(numbers, 0.0, where=lost[:, None])
+        # tied parameters and axes: from derivatives by parameters to those by unknowns
         if self.structure.turn is None:
             return numbers
         d, n_turned = self.layout.own_motion.shape[1], self.structure.turn.columns.shape[1]
@@ -373,8 +386,9 @@ class Problem:
         return turned
 
     def _of_rest(self, closures: Array, boards: Array) -> Array:
-        """Derivatives (B, K, r', na) of closures and boards by all shared unknowns, from those of
-        the closures (B, K, E, n) and the boards (B, K, 6 G, na).
+        """Derivatives (B, K, r', na) of closures and boards by all shared unknowns.
+
+        closures : (B, K, E, n) by the structure's ``closure_index``. boards : (B, K, 6 G, na).
         """
         count, (*batch, equations, _) = self.unknowns.count, closures.shape
         out = np.zeros((*batch, equations + boards.shape[2], count + 1))
@@ -404,7 +418,7 @@ class Problem:
         return divisions(*self.extent, self.rows_at_once)
 
     def _of_closures(self, c: Closure) -> tuple[Array, Array]:
-        """Derivatives of the closures (B, K, E, n) by the structure's ``closure_index``, and by the
+        """Derivatives (B, K, E, n) of the closures by the structure's ``closure_index``, and by the
         own unknowns; zero where they are not finite.
         """
         by_theta = dense(c, self.nominal.size) if self.layout.shares_motors else c.by_theta
@@ -415,7 +429,7 @@ class Problem:
         return out, self._by_noise(c, by_own(self.layout, c.rows))
 
     def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
-        """Derivatives of the poses by all shared unknowns, (B, K, 6 G, na), and by the own ones."""
+        """Derivatives (B, K, 6 G, na) of the poses by all shared unknowns, and by the own ones."""
         u, boards = self.unknowns, self.pose_blocks
         if not boards.present.size:
             none = (*poses.value.shape[:2], 0)
@@ -456,8 +470,8 @@ class Problem:
         return link_rows(self.link_blocks, self.link_data, self._linked_poses(state), state.T_mount)
 
     def unweighted(self, state: BatchState) -> RowGroups[Array]:
-        """Residuals of each kind, (B, K, G, n), in the standard deviation of each measurement
-        alone: without weights, and without the reduction for edges with correlated shading.
+        """Residuals of each kind, (B, K, G, n), in the standard deviation of a single measurement:
+        without weights, and without the factor for edges with correlated shading.
         """
         count, n_rows = self.extent
         cuts = divisions(count, len(state.z) * n_rows, self.rows_at_once)
@@ -476,7 +490,7 @@ class Problem:
         return RowGroups(rows, plain._poses(state).value, links)  # noqa: SLF001
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
-        """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
+        """Whitened closure rows (B, K, E) as one row per reading, (B, K, m)."""
         return joint_rows(self.layout, self.closure(state).by_reading, c_rows)
 
     def prior_values(self, state: BatchState) -> Array:
@@ -485,9 +499,10 @@ class Problem:
         x = np.zeros((len(state.z), u.count))
         x[:, u.machine] = state.z
         x[:, u.effects] = state.columns
-        mounts = x[:, u.mounts].reshape(len(x), -1, 6)  # of which only places are known
+        # mounts have a prior of their position only
+        mounts = x[:, u.mounts].reshape(len(x), -1, 6)
         mounts[..., 3:] = state.T_mount[..., :3, 3]
-        # of stations only that they are level: where the base's z axis points, that turns them
+        # stations have a prior of their tilt only, by the direction of the base's z axis
         stations, up = x[:, u.stations].reshape(len(x), -1, 6), state.T_camera_base[..., :3, 2]
         stations[..., 0], stations[..., 1] = -up[..., 1], up[..., 0]
         return x @ self.prior.T
@@ -510,13 +525,15 @@ class Problem:
         )
 
     def joint_noise_times(self, factor: Array, state: BatchState) -> Array:
-        """Noise of the readings (B,) times a factor, at least what their closures resolve."""
+        """Noise of the readings (B,) times a factor; at least the resolution of their closures."""
         least = least_joint_noise(self.layout, self.closure(state).by_reading)
         return np.maximum(factor * self.joint_noise, np.minimum(least, self.joint_noise))
 
     def by_readings(self, c: Closure, by: Array) -> Array:
-        """Rows (B, K, E, k) of the closures, in standard deviations, where the readings change by
-        ``by`` (K, m, k).
+        """Derivatives (B, K, E, k) of the closures, in standard deviations, by k changes of the
+        readings.
+
+        by : (K, m, k) changes of the readings.
         """
         return self._by_noise(c, closures_by_readings(self.layout, c.by_reading, by))
 
@@ -537,17 +554,20 @@ class Problem:
         return np.concatenate(parts, axis=-1)
 
     def retract(self, state: BatchState, shared: Array, own: Array) -> BatchState:
-        """Retract the state along a step (B, na) and (B, K, d).
+        """Retract the state along a step, shared (B, na) and own (B, K, d).
 
-        The part of the step that only rotates or shifts the frames is made as an exact frame
-        change. Added linearly it would change the sharp closures and edges at second order, and
-        the minimum of the weak prior on the frames would lie along a curved valley.
+        The part of the step that is a change of frames is applied as an exact rigid motion. Applied
+        linearly, it would change the residuals of closures and edges, which have a small noise, at
+        second order, and the minimum of the weak prior on the frames would lie along a curved
+        valley.
         """
+        # own unknowns of linked configurations are among the shared ones
         u, layout = self.unknowns, self.layout
         if len(self.link_blocks.linked):
             own = own.copy()
             each = (len(own), len(self.link_blocks.linked), own.shape[-1])
             own[:, self.link_blocks.linked] = shared[:, u.linked].reshape(each)
+        # part of the machine's step that is a frame change (y) or another gauge change (slides)
         z = shared[:, u.machine]
         moves = z @ self.structure.moves_of.T
         y, slides = moves[:, :12], moves[:, 12:]
@@ -558,6 +578,7 @@ class Problem:
             motion[..., :6],
             shared[:, u.mounts].reshape(len(z), u.n_mounts, 6),
         )
+        # steps of all poses, without the part by the frame change
         by_frames = (
             station_generators(state.T_camera_base),
             pose_generators(state.T_base_platform),
@@ -565,6 +586,7 @@ class Problem:
         )
         less_frames = np.concatenate(by_frames, axis=1) @ y[:, None, :, None]
         steps = (np.concatenate(steps, axis=1) - less_frames[..., 0], y.reshape(-1, 2, 6))
+        # all poses and both frames retracted at once, then the exact frame change
         still = np.broadcast_to(np.eye(4), (len(z), 2, 4, 4))  # the frames' own poses, E and F
         poses = (state.T_camera_base, state.T_base_platform, state.T_mount, still)
         poses = perturb(np.concatenate(poses, axis=1), np.concatenate(steps, axis=1))
@@ -581,7 +603,9 @@ class Problem:
         return self._closed(state, inner, shared, own)
 
     def _in_frames(self, state: BatchState, frames: Array, slides: Array) -> BatchState:
-        """The state after exact changes E and F of both frames (B, 2, 4, 4), and others (B, n)."""
+        """State after exact changes E and F of both frames (B, 2, 4, 4), and the other gauge
+        changes (B, n).
+        """
         layout, (e, f), back = self.layout, frames.swapaxes(0, 1), inverse(frames)
         theta = moved_centres(layout, slid(layout, self.theta(state), slides), e, f)
         theta = on_tangents(layout, theta, self.nominal)
@@ -597,12 +621,17 @@ class Problem:
     def _closed(
         self, state: BatchState, trial: BatchState, shared: Array, own: Array
     ) -> BatchState:
-        """The trial state with poses at which the closures have the values that the step predicts,
-        where their curvature exceeds their noise; without it the search would be slow there.
+        """Trial state with poses at which the closures have the values that the linear model
+        predicts.
+
+        Applied to configurations whose closures are curved by more than their noise; without it the
+        search converges slowly there.
         """
         layout = self.layout
         if layout.n_equations != layout.own_motion.shape[1]:
             return trial
+        # values of the closures that the linear model predicts, then Newton steps of the poses to
+        # them
         bent = self._bent(state, trial)
         if not bent.any():
             return trial
@@ -628,10 +657,10 @@ class Problem:
     def _bent(self, state: BatchState, trial: BatchState) -> Booleans:
         """Configurations (B, K) whose closures are curved over a step by more than their noise.
 
-        Readings of cranks and sliders are far sharper than a board's poses, and equations of
-        joints' axes as good as exact, so theirs always do. A leg of length l that is read becomes
-        longer by ``d^2 / 2 l`` where its end goes d across; near a singular pose, where lengths
-        hardly say where the platform is, they would put it far away.
+        All where cranks or sliders are read, which are far sharper than a board's poses, or where
+        joint axes are constraints, which are almost exact. Otherwise by the second-order elongation
+        ``d^2 / 2 l`` of a leg of length l whose end moves across by d. None near a singular pose,
+        where the lengths hardly determine the pose and a Newton step would move it far away.
         """
         layout, before, after = self.layout, state.T_base_platform, trial.T_base_platform
         if len(layout.angles) or any(group.carrier.driven for group in layout.base):

@@ -1,8 +1,8 @@
 """Reduced rows of the edges, shift and tilt separated, with their hat matrix.
 
-The two residuals of an edge, in the noise of the solution, are rotated into the one along the
-change by a shift outward and the one across it, the tilt. The hat matrix of both is the part of the
-configuration's own unknowns, ``q q^T``, plus that of the shared ones, ``t t^T`` with ``t = F^T J``,
+The two residuals of an edge, in the noise of the solution, are rotated into the shift, along the
+change by a shift outward, and the tilt, across it. The hat matrix of both is the part ``q q^T`` of
+the configuration's own unknowns plus the part ``t t^T`` of the shared ones with ``t = F^T J``,
 where J are the reduced rows and ``F F^T`` is the covariance of the shared unknowns.
 """
 
@@ -23,17 +23,17 @@ from pkmcal.solver.strips import Eliminated, StripLayout, eliminate_strips
 
 @dataclass(frozen=True)
 class ReducedEdges:
-    """Reduced edges of some configurations of B runs, in strips: N strips of r numbers, shift and
-    tilt of one edge after the other.
+    """Reduced edges of some configurations of B runs: N strips of r numbers, shift and tilt of one
+    edge after the other.
 
     problem : restricted to these configurations.
-    first : number of the first of them.
-    layout : of the strips.
+    first : number of the first configuration.
+    layout : layout of the strips.
     value : (B, N, r) residuals.
-    own : (B, N, d, r) parts q of the own unknowns in the hat matrix.
+    own : (B, N, d, r) rows q by the own unknowns in an orthonormal basis.
     numbers : (B, w, N, r) rows by the shared unknowns of the strips' columns.
     by_linked : (B, N, d, r) rows by the own unknowns of linked configurations, which are shared.
-    eliminated : the configurations' elimination.
+    eliminated : elimination of the own unknowns.
     """
 
     problem: Problem
@@ -47,11 +47,11 @@ class ReducedEdges:
 
     @property
     def at(self) -> tuple[Integers, Integers]:
-        """Configuration (N, 1) and place (N, r / 2) of each edge; place -1 for padding."""
+        """Configuration (N, 1) and position (N, r / 2) of each edge; -1 for padding."""
         return _edges_at(self.layout)
 
     def placed(self, numbers: Array) -> Array:
-        """Numbers (B, N, r) at the edges' places, (B, K', G, 2)."""
+        """Scatter numbers (B, N, r) to the edges' positions, (B, K', G, 2)."""
         count, places = self.problem.blocks.present.shape
         # an extra place at the end receives the padding, whose place is -1
         out = np.zeros((len(numbers), count, places + 1, NUMBERS_AN_EDGE))
@@ -60,14 +60,13 @@ class ReducedEdges:
         return out[:, :, :-1]
 
     def shared(self, half: Array) -> Iterator[tuple[slice, Array]]:
-        """Parts t of the shared unknowns in the hat matrix, (B, N', na, r), for each group of
-        strips with the same columns.
+        """Rows t = F^T J, (B, N', na, r), for each group of strips with the same columns.
 
         half : (B, na, na) root F of the covariance.
         """
         at = self.layout.configuration
         of_own = (self.eliminated.along @ half[:, None]).mT
-        by_shared = np.pad(half, ((0, 0), (0, 1), (0, 0)))  # nothing for columns that are none
+        by_shared = np.pad(half, ((0, 0), (0, 1), (0, 0)))  # zero for padding columns
         linked = self.layout.linked
         for cut, columns in zip(self.layout.groups, self.layout.columns, strict=True):
             taken = by_shared[:, None, columns].mT @ self.numbers[:, :, cut].swapaxes(1, 2)

@@ -1,10 +1,10 @@
 """Robust start of an estimate: IRLS weights that reject wrong edges, poses and links.
 
 A wrong edge (another leg's, a shadow's) is wrong as a whole, so an edge has one weight by the
-Mahalanobis norm d of its two residuals; so have a board's pose by its six, and any other
-measurement by as many as it has. The search begins with a scale so wide that all measurements have
-weight and narrows it from stage to stage (graduated non-convexity, Geman-McClure weights); it ends
-with weights that are 1 for all inliers.
+Mahalanobis norm d of its two residuals. A board's pose has one weight by its six residuals, and any
+other measurement by all of its residuals. The search begins at a scale so wide that all
+measurements have weight and narrows it from stage to stage (graduated non-convexity, Geman-McClure
+weights); it ends with weights that are 1 for all inliers.
 
 At the first scales most measurements may fit by chance, and the effect of one wrong parameter may
 look like outliers. So where the annealing rejects measurements, least squares of all of them is a
@@ -44,20 +44,20 @@ errors: a smaller scale would promise too much."""
 class RobustOptions:
     """Constants of the search for a robust start."""
 
-    # solver steps of a stage of the annealing where there are poses: against readings a hundred
-    # times sharper they allow short steps only at first, and after a single refused step the scales
-    # would seem settled
+    # solver steps of a stage of the annealing where there are poses. Readings may be a hundred
+    # times sharper than poses; the first steps are then short, and after a single refused step the
+    # scales would seem to have converged
     pose_steps: int = 10
     # largest number of stages of the annealing
     most_stages: int = 30
     # factor of the first scale on the last one, and the largest by which a stage divides the scale
     stage_factor: float = 4.0
-    # share of the scale before from which on a stage has changed nothing, and the annealing ends
+    # ratio of a stage's scale to the previous one above which the annealing has converged
     settled_stage: float = 0.8
     # Geman-McClure scale in units of the residuals' robust scale: an inlier at two of these keeps
     # two thirds of its weight
     geman_mcclure_scale: float = FULL_WEIGHT_DISTANCE
-    # factors on LEAST_SCALE that are tried as a kind's noise scale: powers of two up to this one
+    # a kind's noise scale is searched over LEAST_SCALE times powers of two up to this exponent
     largest_power: int = 12
     # fixed-point steps to a kind's noise scale after that
     scale_steps: int = 5
@@ -76,8 +76,8 @@ ROBUST = RobustOptions()
 class RobustStart(NamedTuple):
     """Start of a robust search.
 
-    weight : (B, K, G) each.
-    scale : (B,) noise scales.
+    weight : (B, K, G) of each kind.
+    scale : (B,) noise scale of each kind.
     steps : solver steps so far.
     """
 
@@ -88,7 +88,7 @@ class RobustStart(NamedTuple):
 
 
 def clean_norm(share: float, count: Integers) -> Array:
-    """Norm that a share of inliers with ``count`` residuals exceeds."""
+    """Norm that a share of inliers exceeds; count : number of residuals of each measurement."""
     pair = np.sqrt(-2 * np.log(share))  # the closed form of two residuals: most are edges
     out = np.full(count.shape, pair)
     others = [int(number) for number in np.unique(count) if number != 2]
@@ -101,8 +101,8 @@ def clean_norm(share: float, count: Integers) -> Array:
 
 
 def as_pairs(kind: RowGroup) -> Array:
-    """Factors (K, G) that convert a kind's norms to those of pairs of residuals: the same share of
-    inliers lies beyond FULL_WEIGHT_DISTANCE.
+    """Factors (K, G) that convert a kind's norms to those of pairs of residuals, so that the same
+    share of inliers lies beyond FULL_WEIGHT_DISTANCE.
     """
     return FULL_WEIGHT_DISTANCE / clean_norm(CLEAN_TAIL_SHARE, kind.count)
 
@@ -151,12 +151,12 @@ def settled_weights(distance: RowGroups[Array], scale: RowGroups[Array]) -> RowG
 def robust_cost(
     problem: Problem, state: BatchState, *, scaled: bool = True, options: RobustOptions = ROBUST
 ) -> tuple[Array, RowGroups[Array], RowGroups[Array]]:
-    """-2 log of the posterior density (B,) at a state, up to a constant; with each kind's weights
-    (B, K, G) and most likely noise scale (B,), which is 1 unless ``scaled``.
+    """-2 log of the posterior density (B,) at a state, up to a constant.
 
-    A measurement of k numbers at a distance d costs ``loss(d / s) + 2 w k log(s)`` at the noise
-    scale s, with its weight w. A rejected measurement costs the same at any scale, and the
-    logarithm is part of the cost, so no solution gains by a larger or smaller noise.
+    Returns also each kind's weights (B, K, G) and most likely noise scale (B,), which is 1 unless
+    ``scaled``. A measurement of k numbers with the norm d costs ``loss(d / s) + 2 w k log(s)`` at
+    the noise scale s, with its weight w. The cost of a rejected measurement does not depend on s,
+    and the logarithm is part of the cost, so no solution gains by a larger or smaller noise.
     """
     values = problem.residuals(state)
     closures = np.nan_to_num(values.value[..., problem.closure_rows])
@@ -213,14 +213,15 @@ def _kind_cost(
 def robust_start(
     problem: Problem, start: BatchState, *, scaled: bool = True, options: RobustOptions = ROBUST
 ) -> RobustStart:
-    """Start near the solution even where measurements are wrong, or parameters far from nominal.
+    """Start near the solution, also where measurements are wrong or parameters far from nominal.
 
-    The end of the annealing; or, where that rejects measurements and least squares of all of them
+    The end of the annealing; where that rejects measurements and least squares of all measurements
     leads to a smaller robust cost, the end of the latter.
 
     scaled : whether noise may be larger than stated.
     """
     annealed = anneal(problem, start, options)
+    # runs in which the annealing rejects measurements
     rejects = [
         np.any(kind.present & (weight < INLIER_WEIGHT), axis=(1, 2))
         for kind, weight in zip(problem.row_groups, annealed.weight, strict=True)
@@ -243,8 +244,8 @@ def robust_start(
         solution = minimise(searched, other.state, tolerance=options.roughly_solved)
         cost, weight, scale = robust_cost(part, solution.state, scaled=scaled, options=options)
         other = RobustStart(solution.state, weight, scale, other.steps + int(solution.steps.max()))
-        # a few wrong edges among thousands always draw least squares away: these iterations go on
-        # only where they cost less at once
+        # A few wrong edges among thousands always bias least squares, so without poses the
+        # iterations continue only if they cost less than the annealing at once.
         if np.all(cost > before - options.loss_change) or not (poses or np.any(cost < usual)):
             break
         before = cost
@@ -269,6 +270,7 @@ def anneal(problem: Problem, start: BatchState, options: RobustOptions = ROBUST)
         for scale in noise_scales(problem, d, LEAST_SCALE)
     ]
     for _ in range(options.most_stages):
+        # next scale: that of the residuals, but at most ``stage_factor`` smaller
         aim = [
             options.geman_mcclure_scale * scale for scale in noise_scales(problem, d, LEAST_SCALE)
         ]
@@ -281,6 +283,7 @@ def anneal(problem: Problem, start: BatchState, options: RobustOptions = ROBUST)
         weight = RowGroups(
             *(geman_mcclure_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True))
         )
+        # weights at that scale, then a few solver steps
         searched = problem.weighted(weight).as_noisy_as_at(state)
         solution = minimise(searched, state, max_steps=most)
         state, steps = solution.state, steps + int(solution.steps.max())

@@ -46,11 +46,12 @@ MOST_TURN_PAIRS = 200_000
 class RotationAxis:
     """Test of the rotations of the boards of one camera and mount.
 
-    hypothesis : rotations that the machine's motion allows. tilt : (N,) rad, deviation of each pose
-    from the hypothesis. expected_tilt : (N,) RMS deviation from noise alone. spread,
-    expected_spread : rad, RMS angle between the axes of pairs of poses and their mean, and its
-    value from noise alone; NaN without pairs that turn. chi2, dof, p_value : of the hypothesis; 0
-    and 1 if there is nothing to test.
+    hypothesis : rotations that the machine's motion allows.
+    tilt : (N,) rad, deviation of each pose from the hypothesis.
+    expected_tilt : (N,) RMS deviation due to noise alone.
+    spread, expected_spread : rad, RMS angle between the axes of pairs of poses and their mean, and
+        its value due to noise alone; NaN without pairs that turn.
+    chi2, dof, p_value : of the hypothesis; dof 0 and p_value 1 if there is nothing to test.
     """
 
     hypothesis: Turning
@@ -124,8 +125,8 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
 
 
 class Frames(NamedTuple):
-    """Rotations with ``measured = camera Rz(angle) board``: their z is the axis, (..., 3,
-    3) each.
+    """Frames of a common axis of rotation: ``measured = camera Rz(angle) board``, (..., 3, 3)
+    each.
     """
 
     camera: Array

@@ -17,7 +17,7 @@ NUMBERS_AN_EDGE = 2
 """Numbers that an edge measures."""
 EDGE_SCATTER_FLOOR = 1e-12
 LEAST_OWN_SHADING = OWN_SHADING / 3
-"""px; lower bound, because a session of few edges cannot determine less."""
+"""Lower bound of an edge's own shading, px: a session of few edges cannot exclude it."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,12 @@ class EdgeScatter:
     """Noise of the edges of a leg's T tubes (first, second, ... of all legs) in B runs.
 
     scale : (B, T) factor on the stated standard deviations.
-    shading : (B, T) px, of each edge beside its line's; used where edges are shaded.
+    shading : (B, T) px, shading of each edge in addition to its line's; used where edges are
+        shaded.
     dof : (B, T) degrees of freedom of Student's distribution.
 
     The standard deviations are those of normal errors with the same information. An estimate holds
-    those of its one run, (T,) each (:meth:`of_run`).
+    the noise of its single run, (T,) each (:meth:`of_run`).
     """
 
     scale: Array
@@ -40,7 +41,7 @@ class EdgeScatter:
 
     @classmethod
     def stated(cls, n_runs: int, n_tubes: int) -> EdgeScatter:
-        """Noise as stated: scale one, usual shading, normal."""
+        """Noise as stated: scale 1, usual shading, normal distribution."""
         full = (n_runs, n_tubes)
         return cls(np.ones(full), np.full(full, OWN_SHADING), np.full(full, np.inf))
 
@@ -61,15 +62,19 @@ class EdgeScatter:
         return (1 + NUMBERS_AN_EDGE / tails) / (1 + square * t_variance(tails) / tails)
 
     def squares(self, blocks: EdgeBlocks, rows: Array) -> Array:
-        """Squares (B, K, G) of the edges' rows (B, K, r) in use, with their weight, as large as
-        those of normal errors.
+        """Squared residuals (B, K, G) of the edges in use, with their weights, scaled to those of
+        normal errors.
+
+        rows : (B, K, r) whitened rows of the edges.
         """
         pairs = rows.reshape(*rows.shape[:2], -1, NUMBERS_AN_EDGE)
         return np.sum(pairs**2, axis=-1) * t_variance(self.dof)[:, blocks.tube]
 
     def factor(self, blocks: EdgeBlocks, data: EdgeData, weight: Array) -> Array:
-        """Scatter (B,) of edges with weights (B, K, G) relative to their stated noise, root mean
-        square; 1 for no edges.
+        """Scatter (B,) of the edges relative to their stated noise, root mean square; 1 without
+        edges.
+
+        weight : (B, K, G) of the edges.
         """
         size = shift_squares(blocks, data)
         scale, shading = (part[:, blocks.tube] for part in (self.scale, self.shading))
@@ -79,8 +84,11 @@ class EdgeScatter:
         return np.sqrt(np.where(count > 0, square / np.maximum(count, EDGE_SCATTER_FLOOR), 1.0))
 
     def close_to(self, other: EdgeScatter, share: float) -> bool:
-        """Whether the deviations agree with another's up to a share, those of shading up to a share
-        of the usual, and the degrees of freedom are equal.
+        """Whether standard deviations agree up to a relative difference, and degrees of freedom are
+        equal.
+
+        share : largest difference, relative for the scale, and relative to the usual value or the
+            larger one of ``other`` for the shading.
         """
         scale = np.abs(self.scale / other.scale - 1).max(initial=0.0)
         usual = np.maximum(other.shading, OWN_SHADING)
@@ -88,8 +96,8 @@ class EdgeScatter:
         return max(scale, shading) < share and bool(np.all(self.dof == other.dof))
 
     def beyond(self, before: EdgeScatter, pace: float) -> EdgeScatter:
-        """Extrapolation of the deviations from another's by a factor, with these degrees of
-        freedom.
+        """Extrapolate the standard deviations from those of ``before`` by the factor ``pace``,
+        geometrically.
         """
         scale = before.scale * (self.scale / before.scale) ** pace
         shading = before.shading * (self.shading / before.shading) ** pace
@@ -102,14 +110,14 @@ class EdgeScatter:
 
 
 def shift_squares(blocks: EdgeBlocks, data: EdgeData) -> Array:
-    """Squares of the effect of a shift by one pixel outward on the edges, in stated noise, (B or 1,
-    K, G); zero where nothing is shaded.
+    """Squared effect of a shift by one pixel outward on the edges, in stated noise, (B or 1, K, G);
+    zero for edges without shading.
     """
     return np.where(blocks.n_effective > 0, np.sum(data.by_shift**2, axis=-1), 0.0)
 
 
 def t_variance(tails: Array) -> Array:
-    """Variance of normal errors with the information of Student's distribution of pairs, over the
-    square of its scale.
+    """Variance of normal errors with the same information as Student's distribution of pairs with
+    unit scale.
     """
     return 1 + 2 / (tails + NUMBERS_AN_EDGE)

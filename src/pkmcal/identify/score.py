@@ -9,16 +9,16 @@ standard deviations, the part of G that J does not explain is ``H = (I - J J^+) 
 
     value = -(H^T H)^-1 H^T r,    chi2 = r^T H (H^T H)^-1 H^T r,    moved = -J^+ G value
 
-are, to first order, the results of a further estimate with the violation as an unknown (Rao 1948):
-its value, the decrease of chi2, and the change of the unknowns. Under the model chi2 has as many
-degrees of freedom as there are numbers that the data determine.
+are, to first order, the results of an estimate with the violation as a further unknown (Rao 1948):
+its value, the decrease of chi2, and the change of the unknowns. Under the model, chi2 has as many
+degrees of freedom as the violation has numbers that the data determine.
 
 Correlated rows
 ---------------
-Rows of one configuration may have correlated errors: edges of a hand-held image that light moves,
-or that were measured near the image's own pose. So chi2 is divided by the ratio of the scatter of
-the products with the residuals over the configurations to its expectation, where that is larger
-than one,
+Rows of one configuration may have correlated errors, for example edges of a hand-held image that
+are shifted by light, or measured near a prediction from the image's own pose. So chi2 is divided by
+a cluster-robust factor, the scatter of the products u_c over the configurations relative to its
+expectation for independent errors, where that exceeds one,
 
     f = max(1, K / (K - 1) tr((H^T H)^-1 sum over K configurations c of u_c u_c^T) / k),
     u_c = H_c^T (r + H value)_c,
@@ -26,13 +26,20 @@ than one,
 (Liang and Zeger 1986). f is computed only for violations that would be named, and not for single
 readings, which belong to one configuration.
 
+Rivals
+------
+Two violations may have nearly the same rows after projection: over a small arc the sine of an
+eccentric encoder is nearly a scale. Violations are therefore compared as hypotheses are
+(:mod:`pkmcal.outcome.hypotheses`), by chi2 / 2 less the cost of their numbers: those that a named
+violation does not exclude are its rivals, and its finding names them.
+
 Memory
 ------
-Two passes over the rows, some configurations at a time: for an orthonormal basis Q of the range of
-the shared unknowns, then for the products of all columns with each other, with the basis and with
-r. Only these products are stored, whatever the number of configurations, and
-``H^T H = G^T G - (Q^T G)^T (Q^T G)`` keeps some fourteen digits, of which OBSERVABLE_SQUARE_SHARE
-requires ten.
+The rows are evaluated twice, some configurations at a time: for an orthonormal basis Q of the range
+of the shared unknowns, then for the products of all columns with each other, with the basis and
+with r. Only these products are stored, whatever the number of configurations.
+``H^T H = G^T G - (Q^T G)^T (Q^T G)`` has some fourteen significant digits, of which
+OBSERVABLE_SQUARE_SHARE requires ten.
 """
 
 from __future__ import annotations
@@ -50,21 +57,25 @@ from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm, Search
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.measurements import Column
+from pkmcal.outcome.hypotheses import OPTIONS, parameter_cost
 from pkmcal.solver.elimination import Linear, eliminate
 from pkmcal.solver.ranks import inverse_root
 
 OBSERVABLE_SQUARE_SHARE = 1e-10
-"""Smallest share of a violation's squared rows, after projection, that counts as observable; less
-is rounding. A ten-thousandth is left of a reading, a hundred times sharper than the edges."""
+"""Squared length of a projected column, relative to the column, below which it is rounding. For a
+reading that is a hundred times sharper than the edges the ratio is 1e-4."""
 MOST_VIOLATIONS_SOUGHT = 4
-"""Most violations that are named; a session with more has another fault."""
+"""Largest number of named violations; a session with more has another fault."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """Result of a score test: decrease of chi2 by dof numbers; chance : p-value of this test;
-    adjusted : that among all tests of a session (:mod:`pkmcal.identify.false_alarm`), with equal
-    shares for the families, NaN for a test alone.
+    """Result of a score test.
+
+    chi2, dof : decrease of chi2, and its degrees of freedom.
+    chance : p-value of this test.
+    adjusted : p-value among all tests of a session (:mod:`pkmcal.identify.false_alarm`), with equal
+        shares of the level for the families; NaN for a single test.
     """
 
     chi2: float
@@ -75,8 +86,10 @@ class Score:
 
 @dataclass(frozen=True)
 class OneStepUpdate:
-    """First-order estimate of a violation: value, sigma (k,), and by_data (P,), the change of the
-    machine's parameters, m and rad. Unobservable numbers are NaN, with infinite sigma.
+    """First-order estimate of a violation.
+
+    value, sigma : (k,) numbers of the violation; NaN, with infinite sigma, where unobservable.
+    by_data : (P,) change of the machine's parameters, m and rad.
     """
 
     value: Array
@@ -105,15 +118,18 @@ class ScoreTests:
     ) -> None:
         """Evaluate the products of all columns.
 
-        families : number of each listed violation's family. The level of the search is shared
-        equally among the families, and within a family among its tests. One family if absent;
-        single readings are a family of their own. beside : columns with a prior, which count as
-        further unknowns. variance : factor on the variance of all residuals, for further errors.
+        listed : violations to test.
+        families : number of each listed violation's family, all one family by default. The level of
+            the search is shared equally among the families, and within a family among its tests.
+            Single readings are a family of their own.
+        singles : test every single reading too.
+        beside : columns with a prior, which are further unknowns (random effects).
+        variance : factor on the variance of all residuals, for further errors.
         false_alarm : level of the session.
         """
         self._false_alarm = false_alarm
         self._variance, self._scatter = variance, dict[int, float]()
-        basis = _basis_beside(assembled, info, beside)
+        basis = _augmented_basis(assembled, info, beside)
         self._problem = assembled, info, listed, basis, beside
         self._made = _products(assembled, info, listed, basis, singles, beside)
         family = np.zeros(len(listed), dtype=int) if families is None else np.array(families)
@@ -122,12 +138,14 @@ class ScoreTests:
         self._moves = -(info.problem.free @ basis[info.problem.unknowns.machine])
 
     def scores(self, freed: Sequence[int] = ()) -> list[Score]:
-        """Scores of all violations in their order, beside those that are ``freed``, whose gain is
-        zero.
+        """Scores of all violations in their order, with those in ``freed`` as further unknowns.
+
+        The score of a freed violation is zero.
         """
         from scipy.special import chdtrc
 
         made, chi2, dof = self._made, np.zeros(len(self._family)), np.zeros(len(self._family))
+        # listed violations, their columns projected orthogonally to the freed ones
         free = _ProjectedColumns.of(made, freed)
         for k in range(len(made.listed)):
             alone = _ProjectedColumns.of(made, [k])
@@ -142,6 +160,7 @@ class ScoreTests:
         chi2 /= self._variance
         for k, factor in self._scatter.items():
             chi2[k] /= factor
+        # p-values, and those adjusted for all tests of the session
         dof[list(freed)] = 0
         tests = np.bincount(self._family, weights=dof > 0)
         times = np.count_nonzero(tests) * tests[self._family]
@@ -153,21 +172,50 @@ class ScoreTests:
         return [Score(*one) for one in every]
 
     def significant(self, freed: Sequence[int] = ()) -> list[tuple[int, Score]]:
-        """Violations, by number, that are significant at the level of the session, the smallest
-        p-value first; each is tested beside those before it and beside the ``freed``.
+        """Violations that are significant at the level of the session, by forward selection.
+
+        Returns their numbers and scores, the smallest p-value first; each is tested with the
+        previous ones and the ``freed`` ones as further unknowns.
         """
         out: list[tuple[int, Score]] = []
         while len(out) < min(MOST_VIOLATIONS_SOUGHT, len(self._family)):
             scores = self.scores([*freed, *(k for k, _ in out)])
-            # chances below the smallest number are all zero
+            # p-values that underflow are equal: chi2 decides between them
             best = min(range(len(scores)), key=lambda k: (scores[k].adjusted, -scores[k].chi2))
             if scores[best].adjusted > self._false_alarm.level:
                 break
+            # the cluster factor is computed for candidates only, which are then ranked again
             if best < len(self._made.listed) and best not in self._scatter:
-                self._scatter[best] = self._scattered(best, [*freed, *(k for k, _ in out)])
+                self._scatter[best] = self._cluster_factor(best, [*freed, *(k for k, _ in out)])
                 continue
             out.append((best, scores[best]))
         return out
+
+    def rivals(self, named: int, others: Sequence[int]) -> list[int]:
+        """Listed violations that a named one does not exclude, the likeliest first.
+
+        others : violations that are estimated in either case. Variants of the named violation, with
+        its code and subject, are no rivals.
+        """
+        listed, n = self._problem[2], int(np.count_nonzero(self._problem[0].observed))
+        meanings = {
+            (listed[k].code, listed[k].subject) for k in (named, *others) if k < len(listed)
+        }
+        free = [k for k, one in enumerate(listed) if (one.code, one.subject) not in meanings]
+
+        def likely() -> list[tuple[float, int]]:
+            scores = self.scores(others)
+            odds = [one.chi2 / 2 + parameter_cost(one.dof, n) for one in scores]
+            least = max(odds[named] - OPTIONS.act, OPTIONS.report)
+            return sorted(((odds[k], k) for k in free if odds[k] > least), reverse=True)
+
+        for _, k in likely():
+            if k not in self._scatter:
+                self._scatter[k] = self._cluster_factor(k, others)
+        once: dict[tuple[str, str], int] = {}
+        for _, k in likely():
+            once.setdefault((listed[k].code, listed[k].subject), k)
+        return list(once.values())
 
     def fitted(self, freed: Sequence[int]) -> list[OneStepUpdate]:
         """One-step updates of some violations, all estimated together."""
@@ -175,7 +223,7 @@ class ScoreTests:
         value, sigma = -free.inverse @ free.value, np.sqrt(np.diag(free.inverse))
         factors = [self._variance * self._scatter.get(k, 1.0) for k in freed]
         sigma = sigma * np.sqrt(np.repeat(factors, [made.count(k) for k in freed]))
-        # no value where a part of the number is unobservable
+        # a number with a component in an unobservable direction has no estimate
         sigma[free.hidden > NEGLIGIBLE] = np.inf
         cuts = np.cumsum([made.count(k) for k in freed])[:-1]
         return [
@@ -185,19 +233,22 @@ class ScoreTests:
             for k, v, s in zip(freed, np.split(value, cuts), np.split(sigma, cuts), strict=True)
         ]
 
-    def _scattered(self, k: int, freed: Sequence[int]) -> float:
-        """Factor f of a listed violation beside those that are ``freed``."""
+    def _cluster_factor(self, k: int, freed: Sequence[int]) -> float:
+        """Cluster-robust factor f of a listed violation, with those in ``freed`` as further
+        unknowns.
+        """
         assembled, info, listed, basis, random = self._problem
         made, problem = self._made, info.problem
-        # single readings stay as they are
+        # single readings belong to one configuration and have no cluster factor
         every = [*(f for f in freed if f < len(made.listed)), k]
         of_basis = np.concatenate([made.with_basis(f) for f in every]).T
         free = _ProjectedColumns.of(made, every)
         value, n = -free.inverse @ free.value, made.count(k)
-        # what is left of the departure's columns beside those of the others
+        # the violation's columns projected orthogonally to those of the other violations
         rest, own = slice(0, len(value) - n), slice(len(value) - n, None)
         gain = np.linalg.pinv(free.squared[rest, rest]) @ free.squared[rest, own]
         part = np.concatenate([-gain, np.eye(n)])
+        # scatter of u_c over the configurations (clusters)
         throughout = [listed[f] for f in every if listed[f].station is None]
         columns = columns_of(assembled, info.state, throughout)
         by_random, root = columns_of(assembled, info.state, random), prior_root(random)
@@ -224,15 +275,17 @@ class ScoreTests:
             products = ((h @ part).mT @ remainder[..., None])[..., 0]
             scatter += products.T @ products
             clusters += int(np.count_nonzero(products.any(axis=-1)))
+        # one cluster has no scatter
         if clusters < 2:
             return 1.0
         scale = free.scale[own]
-        size, ways = np.linalg.eigh(part.T @ free.squared @ part / scale / scale[:, None])
+        # trace in the observable directions
+        size, vectors = np.linalg.eigh(part.T @ free.squared @ part / scale / scale[:, None])
         observable = size > OBSERVABLE_SQUARE_SHARE
         if not observable.any():
             return 1.0
-        ways = ways[:, observable] / scale[:, None]
-        usual = np.mean(np.einsum("ij,ik,kj->j", ways, scatter, ways) / size[observable])
+        vectors = vectors[:, observable] / scale[:, None]
+        usual = np.mean(np.einsum("ij,ik,kj->j", vectors, scatter, vectors) / size[observable])
         return max(1.0, float(usual) / self._variance * clusters / (clusters - 1))
 
 
@@ -245,12 +298,15 @@ class _Listed(NamedTuple):
 
 @dataclass(frozen=True)
 class _Products:
-    """Products of all columns with each other, their configurations' own unknowns eliminated.
+    """Products of all columns, the configurations' own unknowns eliminated.
 
-    n : columns of the stations and of the listed violations, which come first; then the basis, then
-    the residuals, w in all. after : by first configuration, products (n, w) of these columns with
-    all from it on. single : (K', m, w) of the single readings' columns with all, among : (K', m, m)
-    with each other. by_basis : (nb,) of the basis with the residuals, rows of the prior included.
+    n : number of columns of the stations and of the listed violations. They come first; then the
+        basis, then the residuals, w columns in all.
+    after : by first configuration, products (n, w) of these n columns with all, summed from that
+        configuration on.
+    single : (K', m, w) products of the single readings' columns with all.
+    among : (K', m, m) products of the single readings' columns with each other.
+    by_basis : (nb,) products of the basis with the residuals, prior rows included.
     """
 
     listed: tuple[_Listed, ...]
@@ -261,11 +317,11 @@ class _Products:
     by_basis: Array
 
     def count(self, k: int) -> int:
-        """Number of numbers of a violation."""
+        """Number k of a violation's numbers."""
         return len(self.listed[k].columns) if k < len(self.listed) else 1
 
     def with_all(self, k: int) -> Array:
-        """Products of a violation's columns with all, (k, w)."""
+        """Products (k, w) of a violation's columns with all columns."""
         if k < len(self.listed):
             columns, since = self.listed[k]
             return self.after[since][columns]
@@ -273,17 +329,17 @@ class _Products:
         return self.single[row, motor : motor + 1]
 
     def with_basis(self, k: int) -> Array:
-        """Products with the basis, (k, nb)."""
+        """Products (k, nb) of a violation's columns with the basis."""
         return self.with_all(k)[:, self.n : -1]
 
     def with_residuals(self, freed: Sequence[int]) -> Array:
-        """Products of some violations' projected columns with the residuals."""
+        """Products (c,) of some violations' projected columns with the residuals."""
         parts = [np.zeros(0)]
         parts += [self.with_all(k)[:, -1] - self.with_basis(k) @ self.by_basis for k in freed]
         return np.concatenate(parts)
 
     def between(self, k: int, other: int) -> Array:
-        """Products of the columns of two violations, (k, k')."""
+        """Products (k, k') of the columns of two violations."""
         if k >= len(self.listed):
             row, motor = divmod(k - len(self.listed), self.single.shape[1])
             return self.singles_with(other)[row, motor : motor + 1]
@@ -293,7 +349,7 @@ class _Products:
         return self.after[max(one.since, two.since)][np.ix_(one.columns, two.columns)]
 
     def across(self, k: int, freed: Sequence[int]) -> Array:
-        """Products of a violation's projected columns with those of the ``freed`` ones."""
+        """Products (k, c) of a violation's projected columns with those of the ``freed`` ones."""
         parts = [np.zeros((self.count(k), 0))]
         parts += [self.between(k, f) - self.with_basis(k) @ self.with_basis(f).T for f in freed]
         return np.concatenate(parts, axis=1)
@@ -313,8 +369,8 @@ class _Products:
     def gains_of_singles(
         self, freed: Sequence[int], free: _ProjectedColumns
     ) -> tuple[Array, Array]:
-        """Gain of each single reading beside those that are ``freed``, and whether it is
-        observable, (K' m,) each.
+        """Decrease of chi2 by each single reading, (K' m,), with the ``freed`` violations as
+        further unknowns, and whether the reading is observable, (K' m,).
         """
         basis, squared = self.single[..., self.n : -1], np.einsum("kmm->km", self.among)
         residual = squared - np.sum(basis**2, axis=-1)
@@ -332,8 +388,11 @@ class _Products:
 
 @dataclass(frozen=True)
 class _ProjectedColumns:
-    """Columns projected orthogonally to all unknowns: scale (c,) their lengths before, infinite
-    where they are rounding, squared (c, c) products with each other, value (c,) with the residuals.
+    """Products of c columns projected orthogonally to all unknowns.
+
+    scale : (c,) lengths of the columns before projection, infinite where they are rounding.
+    squared : (c, c) products with each other.
+    value : (c,) products with the residuals.
     """
 
     scale: Array
@@ -346,22 +405,24 @@ class _ProjectedColumns:
         lengths = [np.zeros(0)]
         for k in freed:
             length = np.sqrt(np.maximum(np.diag(made.between(k, k)), 0.0))
-            # columns that are rounding, as for a shift of a height probe along the bed
+            # columns that are rounding, such as a shift of a height probe along the bed
             least = ROUNDING * length.max(initial=0.0)
             lengths.append(np.where(length > least, length, np.inf))
         squared = [np.zeros((0, 0)), *(made.across(k, freed) for k in freed)][len(freed) > 0 :]
         return cls(np.concatenate(lengths), np.concatenate(squared), made.with_residuals(freed))
 
     def _directions(self) -> tuple[Array, Array]:
-        """Shares of the squared columns that are left in each direction, and the directions."""
+        """Eigenvalues and eigenvectors of the products of columns scaled to length one before
+        projection.
+        """
         return np.linalg.eigh(self.squared / self.scale[:, None] / self.scale)
 
     @property
     def inverse(self) -> Array:
-        """Pseudoinverse of the products (c, c), in the observable directions."""
-        part, ways = self._directions()
+        """Pseudoinverse (c, c) of the products, in the observable directions."""
+        part, vectors = self._directions()
         observable = part > OBSERVABLE_SQUARE_SHARE
-        back = ways[:, observable] / np.sqrt(part[observable]) / self.scale[:, None]
+        back = vectors[:, observable] / np.sqrt(part[observable]) / self.scale[:, None]
         return back @ back.T
 
     @property
@@ -372,23 +433,25 @@ class _ProjectedColumns:
 
     @property
     def hidden(self) -> Array:
-        """(c,) share of each number in unobservable directions."""
-        part, ways = self._directions()
-        return np.sum(ways[:, part <= OBSERVABLE_SQUARE_SHARE] ** 2, axis=1)
+        """Share (c,) of each number's direction that is unobservable."""
+        part, vectors = self._directions()
+        return np.sum(vectors[:, part <= OBSERVABLE_SQUARE_SHARE] ** 2, axis=1)
 
 
 def shared_basis(info: Information) -> Array:
-    """B (na, nb): the rows by the shared unknowns times it are orthonormal."""
+    """B (na, nb) such that the rows by the shared unknowns times B are orthonormal."""
     half = inverse_root(info.rows[0][:1], ROWS_RANK_TOLERANCE, loose=False)[0]
     return half[:, np.any(half != 0, axis=0)]
 
 
-def _basis_beside(assembled: Assembled, info: Information, beside: Sequence[Column]) -> Array:
-    """B (na + l, nb + l): the rows by the shared unknowns and by random effects, in their own
-    standard deviations, times it are orthonormal; those that say so of the effects are among them.
+def _augmented_basis(assembled: Assembled, info: Information, beside: Sequence[Column]) -> Array:
+    """B (na + l, nb + l) such that the rows by the shared unknowns and l random effects, times B,
+    are orthonormal.
 
-    With Q = J B0 the orthonormal rows of the unknowns alone and D the effects' columns, the further
-    ones are ``(D - Q Q^T D) L^-T`` with ``L L^T = 1 + D^T D - (Q^T D)^T Q^T D``.
+    Random effects are in prior standard deviations, so their prior rows are the identity; these
+    count among the rows. With Q = J B0 the orthonormal rows of the unknowns alone and D the
+    effects' columns, the l further columns are ``(D - Q Q^T D) L^-T`` with ``L L^T = 1 + D^T D -
+    (Q^T D)^T Q^T D``.
     """
     basis, root = shared_basis(info), prior_root(beside)
     count = root.shape[1]
@@ -416,9 +479,13 @@ def _products(
     singles: bool,
     beside: Sequence[Column],
 ) -> _Products:
-    """Products of the violations' columns; basis : of the unknowns and of ``beside``."""
+    """Products of the violations' columns.
+
+    basis : of the unknowns and of ``beside``, by :func:`_augmented_basis`.
+    """
     problem, observed = assembled.problem, assembled.observed
     stations, motors = problem.unknowns.stations, problem.layout.n_readings if singles else 0
+    # columns of each violation; a moved station has those of its pose, from a configuration on
     parts: list[_Listed] = []
     n = 6 * problem.unknowns.n_stations
     for effect in listed:
@@ -428,6 +495,7 @@ def _products(
         else:
             since = int(np.count_nonzero(observed[: effect.since]))
             parts.append(_Listed(6 * effect.station + np.arange(6), since))
+    # sums over the configurations
     begins = sorted({0, *(part.since for part in parts)})
     width = n + basis.shape[1] + 1
     sums: dict[int, Array] = {begin: np.zeros((n, width)) for begin in begins}
@@ -468,16 +536,17 @@ def _products(
 
 
 def prior_root(columns: Sequence[Column]) -> Array:
-    """Root (k, l) of the covariance of all numbers of columns with a prior."""
+    """Root (k, l) of the joint prior covariance of the numbers of columns."""
     from scipy.linalg import block_diag
 
     return np.array(block_diag(np.zeros((0, 0)), *(one.prior for one in columns)))
 
 
 def eliminate_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
-    """Rows (K', r, na + k) with columns (K', r, k) beside the unknowns' and residuals (K', r), of
-    which the configurations' own unknowns are eliminated. Columns are zero in rows that are
-    rejected or padding.
+    """Eliminate the configurations' own unknowns from rows with further columns.
+
+    columns : (K', r, k) beside those of the shared unknowns; zero in rows that are rejected or
+        padding. Returns rows (K', r, na + k) and residuals (K', r).
     """
     extra = np.where(linear.usable[0][..., None], columns, 0.0)
     wide = linear._replace(
@@ -491,12 +560,16 @@ def eliminate_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
 def columns_of(
     assembled: Assembled, state: BatchState, listed: Sequence[Column], *, singles: bool = False
 ) -> Callable[[slice, Linear], Array]:
-    """Function that returns the columns (K', r, k) of some configurations from the problem's rows
-    there: of the listed columns in their order, then of the single readings.
+    """Function that evaluates the columns (K', r, k) of some configurations, from the problem's
+    rows there.
+
+    Columns are those of the ``listed`` ones in their order, then, with ``singles``, of each single
+    reading.
     """
     problem, places = assembled.problem, assembled.places
     counts = [effect.count for effect in listed]
     m, n = problem.layout.n_readings, sum(counts)
+    # columns by readings, edges, poses and motions of stations
     readings = np.zeros((len(problem.blocks.present), m, n + (m if singles else 0)))
     readings[..., n:] = np.eye(m)[:, : readings.shape[-1] - n]
     placed: list[tuple[slice, Array | None, Array | None]] = []
@@ -519,6 +592,7 @@ def columns_of(
         c = part.closure(part.state_among(state, cut))
         out = np.zeros((len(part.blocks.present), part.n_rows, readings.shape[-1]))
         out[:, part.closure_rows] = part.by_readings(c, readings[cut])[0]
+        # whitened derivatives of edges and poses; residuals are predicted minus measured
         of_edges = part.data.weighed[0]
         of_poses = (np.sqrt(part.pose_data.weight)[..., None, None] * part.pose_data.whiten)[0]
         before, after = (out[:, kind.rows] for kind in part.row_groups[:2])
@@ -528,6 +602,7 @@ def columns_of(
                 before[..., where] = -(of_edges @ edges[cut]).reshape(shape)
             if poses is not None:
                 after[..., where] = -(of_poses @ poses[cut]).reshape(shape)
+        # motions act as the stations' poses do
         by_station = linear.by_shared[0][..., problem.unknowns.stations]
         for where, motion in moving:
             each = motion[:, cut].swapaxes(0, 1)

@@ -1,6 +1,4 @@
-"""Sentences about unidentifiable directions: what is open, its effect on the platform, and
-advice.
-"""
+"""Sentences about unidentifiable directions: the motion, its effect on the platform, and advice."""
 
 from __future__ import annotations
 
@@ -27,13 +25,13 @@ MOST_NAMES_IN_SENTENCE = 5
 class Sentence:
     """One unidentified or weakly identified motion of the machine.
 
-    text, advice : the user's sentences: what is open, and what to do about it.
+    text, advice : sentences for the user: the motion, and how to determine it.
     parameters : names of the parameters, the most affected first.
     dimensions : number of independent changes.
     moves_platform : root mean square displacement of the platform, over its joints and poses, by
-    these changes as the prior allows them, m.
+        these changes as the prior allows them, m.
     matters : whether that displacement is more than negligible.
-    weak : the data contain information about it, but less than the nominal model does.
+    weak : whether the data contain information on the motion, but less than the nominal model does.
     """
 
     text: str
@@ -54,13 +52,13 @@ def negligible_shift(table: ParameterTable) -> float:
 
 @dataclass(frozen=True)
 class OpenMotion:
-    """A motion that the data leave open, of one or more legs.
+    """A motion of one or more legs that the data do not determine.
 
     space : (k, P) changes that it explains, in prior sigmas.
-    numbers : (n, m) the motion's own coefficients for these, of one leg.
-    own : (k, P) the changes that these coefficients make, in prior sigmas; they differ from
-    ``space`` by frame changes.
-    new : how many of the k no earlier motion explains.
+    numbers : (n, m) coefficients of the motion for these changes, of one leg.
+    own : (k, P) changes made by these coefficients, in prior sigmas; they differ from ``space`` by
+        frame changes.
+    new : number of the k changes that no earlier motion explains.
     """
 
     motion: NamedChanges
@@ -94,7 +92,7 @@ def sentence(
 
     unit : (P,) prior sigmas of the parameters.
     shifted : displacement of the platform's joints, m.
-    weak : the data contain information about it, but less than the nominal model does.
+    weak : whether the data contain information on the motion, but less than the nominal model does.
     """
     table = around.machine.parameters
     matters = shifted > negligible_shift(table)
@@ -169,7 +167,9 @@ def _mostly(around: Situation, open_motion: OpenMotion, rows: Integers, unit: Ar
 
 
 def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
-    """At most ``MOST_SENTENCES`` sentences; the least important ones are counted in the last."""
+    """At most ``MOST_SENTENCES`` sentences; the last one stands for all less important ones, with
+    their number.
+    """
     if len(sentences) <= MOST_SENTENCES:
         return tuple(sentences)
     ranked = sorted(sentences, key=lambda s: -s.moves_platform)
@@ -255,8 +255,9 @@ def _more(around: Situation, legs: tuple[int, ...]) -> str:
 
 
 def _enough(around: Situation, motion: NamedChanges, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Parameters that are sufficient to fix: for a convention one axis, or one end of legs of which
-    only the difference is identifiable.
+    """Parameters that are sufficient to fix.
+
+    For a convention one axis, or one end of legs of which only the difference is identifiable.
     """
     if not motion.convention:
         return names
@@ -267,10 +268,10 @@ def _enough(around: Situation, motion: NamedChanges, names: tuple[str, ...]) -> 
 
 
 def _fixing(around: Situation, names: tuple[str, ...]) -> str:
-    """The line of the mechanism file that fixes parameters, beside those that it fixes already.
+    """Line of the mechanism file that fixes parameters, in addition to those that it fixes already.
 
-    An axis is fixed as a whole; a centre as a whole where all of its coordinates are meant, and all
-    legs at once where all legs with that parameter are meant.
+    An axis is fixed as a whole; a centre as a whole if all of its coordinates are listed, and all
+    legs at once if all legs with that parameter are listed.
     """
     table = around.machine.parameters
     entries: dict[str, None] = {}

@@ -16,7 +16,7 @@ from pkmcal.mechanisms.kinematics import ForwardResult
 
 MEDIAN_TURN_STEPS = 15
 EQUAL_TURNS_ANGLE = 1e-4
-"""rad, about; rotations that differ by less are equal."""
+"""Difference of rotation matrices (Frobenius norm, about rad) below which rotations are equal."""
 
 
 def start_state(
@@ -27,9 +27,10 @@ def start_state(
 ) -> State:
     """Initial state: the machine's present values, and poses by forward kinematics of the readings.
 
-    Readings, not seen directions: the latter lead into local minima (errata, B).
-    T_camera_base_guess : (S, 4, 4). forward : forward kinematics of the machine at these readings,
-    if solved already.
+    Poses from measured directions of the legs would lead into local minima (errata, B).
+
+    T_camera_base_guess : (S, 4, 4).
+    forward : forward kinematics of the machine at these readings, if solved already.
     """
     fk = forward or machine.forward_result(measurements.joints)
     poses = fk.T_base_platform
@@ -45,7 +46,7 @@ def start_state(
 
 
 def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array) -> Array:
-    """Initial T_mount (M, 4, 4) from the measured poses, the stations' and the platform's.
+    """Initial T_mount (M, 4, 4) from the measured poses and the poses of stations and platform.
 
     T_camera_base : (S, 4, 4). poses : T_base_platform (K, 4, 4).
     """
@@ -60,9 +61,10 @@ def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array)
 
 
 def middle_pose(poses: Array) -> Array:
-    """Robust mean (4, 4) of poses (n, 4, 4); the identity of none.
+    """Robust mean (4, 4) of poses (n, 4, 4); the identity for n = 0.
 
-    The turn with the least sum of distances, as the median has it of numbers (Weiszfeld).
+    Positions by the median of each coordinate; the rotation by the geometric median, with
+    Weiszfeld's iteration.
     """
     if not len(poses):
         return np.eye(4)

@@ -15,11 +15,14 @@ from pkmcal.identify.unknowns import Unknowns
 class State:
     """Values of all unknowns.
 
-    theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
-    columns : numbers (n,) of the effects on measurements by their code, change from where the
-    measurements were made; zero where a code is missing. T_mount : (M, 4, 4) boards in the frame of
-    what they are fixed to, T_base_board or T_platform_board by ``on_platform`` (M,). internal :
-    (K, n) hinges of an articulated platform.
+    theta : (P,) machine parameters.
+    T_camera_base : (S, 4, 4).
+    T_base_platform : (K, 4, 4).
+    columns : numbers (n,) of the effects on measurements by code, as changes from the values with
+        which the measurements were made; zero where a code is missing.
+    T_mount : (M, 4, 4) boards in the frame of their body, T_base_board or T_platform_board by
+        ``on_platform`` (M,).
+    internal : (K, n) angles of the hinges of an articulated platform.
     """
 
     theta: Array

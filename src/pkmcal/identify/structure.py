@@ -1,4 +1,4 @@
-"""Structure of a problem: the part that does not depend on weights, noise or state."""
+"""Structure of a problem: all that does not depend on weights, noise or state."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from pkmcal.solver.strips import StripLayout
 
 
 class _Turn(NamedTuple):
-    """Map from the columns of strips, which are parameters, to unknowns, where these differ.
+    """Linear map from the columns of strips, which are parameters, to unknowns, where these differ.
 
-    by : (groups, w, w') for the strips with the same columns. columns : (groups, w') numbers of the
-    shared unknowns.
+    by : (groups, w, w') for each group of strips with the same columns.
+    columns : (groups, w') numbers of the shared unknowns.
     """
 
     by: Array
@@ -30,8 +30,9 @@ class _Turn(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Integers, turn: Array) -> _Turn:
-        """Map for strips with columns ``parameters`` (groups, w); turn : (width, na) of all
-        columns.
+        """Map for strips with the columns ``parameters`` (groups, w).
+
+        turn : (width, na) map of all columns.
         """
         used = [np.flatnonzero(np.any(turn[own] != 0, axis=0)) for own in parameters]
         most = max((len(own) for own in used), default=0)
@@ -45,8 +46,9 @@ class _Turn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Structure of a problem with these parts (:class:`~pkmcal.identify.problem.Problem`),
-    evaluated lazily and shared by all problems of the same measurements.
+    """Structure of a problem (:class:`~pkmcal.identify.problem.Problem`) with these parts.
+
+    Evaluated lazily, and shared by all problems of the same measurements.
     """
 
     layout: LimbLayout
@@ -58,7 +60,7 @@ class Structure:
     link_blocks: LinkBlocks
 
     def made_of(self, *parts: object) -> bool:
-        """Whether its parts are these objects, in their order."""
+        """Whether the structure has these parts (the same objects), in their order."""
         own = (
             self.layout, self.nominal, self.free, self.unknowns, self.blocks, self.frames,
             self.link_blocks,
@@ -88,20 +90,24 @@ class Structure:
 
     @cached_property
     def choice(self) -> Integers | None:
-        """Parameter of each free unknown, where each changes one parameter only; else None."""
+        """Parameter (nz,) of each free unknown if each is exactly one parameter; otherwise None
+        (tied parameters, axes).
+        """
         alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
         return np.argmax(self.free, axis=0) if alone else None
 
     @cached_property
     def width(self) -> int:
-        """Columns of an edge's row while it is written: the shared unknowns, one for each parameter
-        where parameters are tied or are axes, and one for padding.
+        """Number of columns of an edge's row before the map to unknowns.
+
+        The shared unknowns, one column for each parameter where parameters are tied or are axes,
+        and one for padding.
         """
         return self.unknowns.count + 1 + (0 if self.choice is not None else self.nominal.size)
 
     @cached_property
     def column(self) -> Integers:
-        """Column of each parameter's derivatives, (P + 1,); the last is for padding."""
+        """Column (P + 1,) of each parameter's derivatives; the last one is for padding."""
         if self.choice is None:
             return self.unknowns.count + np.arange(self.nominal.size + 1)
         out = np.full(self.nominal.size + 1, self.unknowns.count)
@@ -110,8 +116,9 @@ class Structure:
 
     @cached_property
     def moves_of(self) -> Array:
-        """Frame changes and others (12 + n, nz) that explain most of a step of z, by least squares
-        at the nominal model; the remainder is small and added linearly.
+        """Gauge changes (12 + n, nz) by a step of z: least-squares fit at the nominal model.
+
+        The remainder of the step is small and applied linearly.
         """
         by_moves = self.to_free @ move_generators(self.layout, self.nominal, self.nominal)
         return self.frames @ np.linalg.pinv(by_moves @ self.frames)
@@ -124,7 +131,7 @@ class Structure:
 
     @cached_property
     def strips(self) -> StripLayout:
-        """Layout of the views as strips."""
+        """Layout of the views' rows as strips."""
         views, columns = self.blocks.views, self.strip_parameters
         n_rows = 2 * self.blocks.side.shape[-1]
         place = n_rows * (views.place % max(self.blocks.present.shape[1], 1))
@@ -166,7 +173,9 @@ class Structure:
 
     @cached_property
     def own_radii(self) -> Array:
-        """Indicator (radii, N, n) of the radius of its leg on which each row depends."""
+        """Indicator (radii, N, n) of the radius, among those of its leg, on which each row
+        depends.
+        """
         views, n_rows = self.blocks.views, 2 * self.blocks.side.shape[-1]
         radii = max((len(self.layout.radius[leg]) for leg in np.unique(views.leg)), default=0)
         used = views.taken(self.blocks.tube) == np.arange(radii)[:, None, None]
@@ -183,8 +192,9 @@ class Structure:
 
     @cached_property
     def closure_index(self) -> Integers:
-        """Parameters (E, n) on which the closures depend; rods on one motor share their noise, so
-        each depends on the parameters of all.
+        """Parameters (E, n) on which the closures depend.
+
+        Rods on one motor share the noise of its reading, so each depends on all parameters.
         """
         if self.layout.shares_motors:
             return np.tile(np.arange(self.nominal.size), (self.layout.n_equations, 1))
@@ -192,7 +202,7 @@ class Structure:
 
     @cached_property
     def closure_turn(self) -> Array:
-        """(E, n, nz) map from derivatives by ``closure_index`` to derivatives by the free
+        """Map (E, n, nz) from derivatives by ``closure_index`` to derivatives by the free
         unknowns.
         """
         return np.pad(self.free, ((0, 1), (0, 0)))[self.closure_index]

@@ -25,7 +25,9 @@ from pkmcal.solver.ranks import nonzero
 
 @dataclass(frozen=True)
 class PoseSamplingOptions:
-    """Constants of the poses sampled around a session's, for errors that few poses hide."""
+    """Constants of the poses sampled around a session's, which weigh errors outside of its
+    workspace.
+    """
 
     # number of samples, and their seed
     count: int = 40
@@ -35,8 +37,8 @@ class PoseSamplingOptions:
     # range of the translation, relative to the machine's size, the mean distance from base to
     # platform plus the platform's radius
     shift: float = 0.12
-    # smallest distance of a sample from singular poses, relative to the median of the session's
-    # own: near a singular pose any error is amplified, and no machine works there
+    # smallest distance of a sample from singular poses, relative to the median over the session:
+    # near a singular pose any error is amplified, and no machine works there
     regular: float = 0.7
 
 
@@ -109,15 +111,17 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class ToolAccuracy:
-    """Errors of n poses of the platform: covariance after calibration, and differences to the
-    nominal model's poses; NaN where the machine cannot take a pose, or the nominal model has none.
+    """Errors of n poses of the platform.
+
+    The covariance after calibration, and the differences from the nominal model's poses; NaN where
+    the machine, or the nominal model, cannot take a pose.
 
     T_base_platform : (n, 4, 4) as calibrated.
     by_parameters : (n, 6, P) derivatives of the poses (omega, tau), left perturbation, frames
-    removed.
+        removed.
     parameters : (P, P) covariance of the parameters in the same gauge.
     off : (n, 6) difference from the calibrated pose to the nominal one at the same readings, frames
-    aligned.
+        aligned.
     """
 
     T_base_platform: Array
@@ -185,7 +189,9 @@ def centres_and_tool(
     nominal: Machine, estimate: Estimate, joints: Array | None
 ) -> tuple[tuple[Centres, ...], ToolAccuracy]:
     """Joint centres of an estimate, and errors of the poses of the configurations in use,
-    gauge-free; joints (K, m), None for those of the calibrated machine.
+    gauge-free.
+
+    joints : (K, m) readings; by default those at which the calibrated machine takes the poses.
     """
     machine, used = estimate.machine, estimate.configurations
     covariance = free_of_gauge(machine, estimate.covariance)
@@ -209,13 +215,13 @@ def tool_error(
     """Errors of poses T_base_platform (n, 4, 4) of the calibrated machine and of the nominal model.
 
     covariance : (P, P) of the parameters about the best fit of the frames
-    (:func:`~pkmcal.identify.centres.free_of_gauge`), so that no three joints define the frames.
-    joints : (n, m) readings at the poses; by default the poses are first projected onto those that
-    rods and axes allow, and readings are the calibrated machine's.
-    legs_observed : whether legs were measured, which determine the joint centres and by them the
-    frames. A board leaves unidentified all shifts of joints that do not move the platform, so
-    without legs the frames are aligned by the poses themselves, all or the ``fitted`` (k,) among
-    them.
+        (:func:`~pkmcal.identify.centres.free_of_gauge`), so that no three joints define the frames.
+    joints : (n, m) readings at the poses. By default the poses are first projected onto those that
+        rods and axes allow, and the readings are those of the calibrated machine.
+    legs_observed : whether legs were measured, which determine the joint centres and thereby the
+        frames. A board leaves shifts of joints that do not move the platform undetermined, so
+        without legs the frames are aligned by the poses.
+    fitted : (k,) poses that align the frames, all by default.
     """
     layout, n, theta = calibrated.layout, len(poses), calibrated.values
     if joints is None:
@@ -246,13 +252,15 @@ def without_frames(
     every: bool = False,
     fitted: Integers | None = None,
 ) -> Array:
-    """Changes (n, 6, m) of poses without their best-fitting frame changes of base and platform.
+    """Changes (n, 6, m) of poses with their best-fitting frame changes of base and platform
+    removed.
 
-    The fit is by least squares over all poses, or the ``fitted`` (k,) among them, as far as their
-    changes are finite; rotations are weighted by the radius of the platform's joints. Only frame
-    changes that keep the motion are removed, and of these, unless ``every`` is set, only those that
-    no parameters follow (some are fixed, or tied): the others are already removed from the
-    parameters' covariance.
+    The fit is by least squares over the poses with finite changes; rotations are weighted by the
+    radius of the platform's joints. Only frame changes that preserve the motion are removed.
+
+    every : remove all of them. By default only those that the parameters cannot follow, because
+        some are fixed or tied; the parameters' covariance does not contain the others.
+    fitted : (k,) poses for the fit, all by default.
     """
     rest = respecting_motion(machine.layout.motion)
     if not every:
@@ -273,11 +281,11 @@ def without_frames(
 
 def _off(nominal: Machine, calibrated: Machine, joints: Array, poses: Array) -> Array:
     """Differences (n, 6) of the nominal from the calibrated poses, left perturbation; NaN where
-    either machine has none.
+    either machine cannot take the pose.
 
-    Only the components along the motion count: the registration of joint centres may tilt the
-    frames of a planar machine with joints at several heights, or of a delta, against each other,
-    which tilts no platform.
+    Only components along the motion count. The registration of joint centres may tilt the frames
+    against each other, for a delta or a planar machine with joints at several heights, without a
+    tilt of the platform.
     """
     along = calibrated.layout.motion @ calibrated.layout.motion.T
     nothing = np.zeros((calibrated.values.size, calibrated.values.size))

@@ -1,12 +1,12 @@
-"""Unidentifiable directions, described by motions with a name.
+"""Unidentifiable directions, described by named motions.
 
     data -> null space of their information -> nearest named motions -> sentences
 
-The null space has no axes of its own: any rotation of a basis is as good. So named motions
-(:mod:`pkmcal.identify.motions`) are compared with the whole space, one after the other: a motion
-that lies in the space is removed from it and described (:mod:`pkmcal.identify.sentences`), and the
-rest of the space is left for the next motion. All comparisons are in units of the prior sigmas,
-with the freedoms of the frames removed.
+The basis of a null space is arbitrary. So named motions (:mod:`pkmcal.identify.motions`) are
+compared with the whole space, one after the other: a motion that lies in the space is removed from
+it and described (:mod:`pkmcal.identify.sentences`), and the next motion is compared with the
+remaining space. All comparisons are in units of the prior sigmas, with the freedoms of the frames
+removed.
 """
 
 from __future__ import annotations
@@ -41,9 +41,8 @@ if TYPE_CHECKING:
     from pkmcal.measurements import EdgeSet, Measurements
 
 CONVENTION_NULL_SHARE = 1e-6
-"""Residual effect of a fixed parameter, in m per m or rad, that the free parameters cannot
-reproduce, below which it is a convention: both are derivatives of one machine, equal but for
-rounding."""
+"""Effect of a fixed parameter on the platform, in m per m or rad, that the free parameters cannot
+reproduce; below this value it is rounding, and the parameter is a convention."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Condition:
     """One of [A]'s conditions, counted by :mod:`pkmcal.identify.conditions`.
 
     equation : its number in the paper.
-    needed, available : counts.
+    needed, available : numbers of unknowns and of equations.
     met : needed <= available.
     text : sentence on what is counted.
     """
@@ -65,21 +64,21 @@ class Condition:
 
 @dataclass(frozen=True)
 class Identification:
-    """Directions of the machine that the data determine, and those that they leave unidentified.
+    """Directions of the machine that the data determine, and those that they do not.
 
     identifiability : rank and spectrum of the information.
     unidentified : sentences on directions without information, or with less than
         ``UnidentifiedOptions.weak``.
-    weak : sentences on directions of which the nominal model contains more information.
+    weak : sentences on directions that the nominal model determines better than the data.
     by_nominal : displacement of the platform by the prior sigmas of all parameters, m, as
         ``Sentence.moves_platform``.
-    undetermined_shift : the same by the errors of the nominal model that the data leave, m.
+    undetermined_shift : displacement of the platform by the part of the nominal model's errors that
+        the data do not correct, m.
     n_harmless : number of independent unidentifiable changes that do not move the platform.
     conditions : [A]'s conditions.
-    conventional : fixed parameters for which any value would do.
-    also_conventional : number of combinations of other fixed parameters for which any value would
-        do.
-    bed : predicted flatness, where nothing but heights was measured.
+    conventional : fixed parameters that are conventions; any value would do.
+    also_conventional : number of combinations of other fixed parameters that are conventions.
+    bed : predicted flatness, if only heights were measured.
     """
 
     identifiability: Identifiability
@@ -104,14 +103,14 @@ def explain(
     bed: Bed | None = None,
     options: UnidentifiedOptions = UNIDENTIFIED,
 ) -> Identification:
-    """What an estimate determines.
+    """Identification of an estimate: what the data determine, with sentences on the rest.
 
-    The displacements and numbers of changes, on which a verdict depends, are those of the whole
-    space; motions with names only word it.
+    The displacements and numbers of changes, on which a verdict depends, are computed from the
+    whole null space; named motions are used for the sentences only.
 
     visible : (S, L) legs that each station measures; stations that a board on the base joins count
-    as one, see :func:`observed_by_boards`.
-    bed : where nothing but heights was measured.
+        as one, see :func:`observed_by_boards`.
+    bed : predicted flatness, if only heights were measured.
     """
     machine, table = estimate.machine, estimate.machine.parameters
     # situation of the session, and effect of the parameters on the platform
@@ -122,7 +121,7 @@ def explain(
     unseen = {id(d) for d in ranks.unidentified}
 
     def space(directions: tuple[ParameterDirection, ...]) -> tuple[Array, Array]:
-        """Some directions and their information."""
+        """Directions as rows, and their information."""
         reference = [0.0 if id(d) in unseen else d.information for d in directions]
         return direction_vectors(directions, machine), np.array(reference)
 
@@ -133,12 +132,12 @@ def explain(
     # a direction with information s, in units of the prior, has the posterior variance
     # 1 / (1 + s^2): 1 / (1 + s^2)^2 by the nominal model's errors, the rest by the data's noise
     left = ranks.directions / (1 + ranks.singular_values[:, None] ** 2)
-    # directions by information
+    # sentences on undetermined directions, and on those that the nominal model determines better
     least = options.weak
     lost = (*ranks.unidentified, *(d for d in ranks.weak if d.information < least))
     weak = tuple(d for d in ranks.weak if d.information >= least)
-    # poses and heights mix weakly identified directions with unidentified ones: only both together
-    # have names
+    # Singular directions of poses and heights are mixtures of weakly identified and unidentified
+    # motions, so only the whole space contains the named motions.
     sentences = (*text(lost), *text(weak)) if imaged else text((*lost, *weak))
     conventional, others = conventions_held(machine, effect)
     return Identification(
@@ -156,22 +155,19 @@ def explain(
 
 
 def only_heights(estimate: Estimate) -> bool:
-    """Whether nothing but heights was measured; components that are not measured have no
-    residual.
-    """
+    """Whether only heights were measured; components that are not measured have zero residuals."""
     poses = estimate.pose_residuals
     others = estimate.edge_weights.size + estimate.link_weights.size
     return not others and len(poses) > 0 and not poses[:, :5].any()
 
 
 def identified(machine: Machine, covariance: Array) -> Booleans:
-    """Whether the data determine each of the six numbers of poses, (..., 6). The others are
-    conventions, or starting values, and are not reported as numbers.
+    """Whether the data determine each of the six numbers of poses, (..., 6).
 
-    Positions are compared with the machine's size, their prior, and rotations with one radian: a
-    number whose standard deviation is not below half of that is not determined by the data.
-
-    covariance : (..., 6, 6), rad and m.
+    The others are conventions or starting values, and are not reported. A number is determined if
+    its standard deviation is below half of its prior scale: the machine's size for positions, one
+    radian
+    for rotations. covariance : (..., 6, 6), rad and m.
     """
     sigma = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 0.0))
     return sigma < MAJORITY * np.repeat([1.0, machine_size(machine)], 3)
@@ -201,9 +197,10 @@ def observed_by_boards(visible: Booleans, measurements: Measurements) -> Boolean
 
 
 def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], int]:
-    """Names of fixed parameters that are conventions, and number of combinations of the other fixed
-    ones that are: free parameters or frames reproduce their whole effect.
+    """Fixed parameters that are conventions, and number of combinations of other fixed ones that
+    are.
 
+    A fixed parameter is a convention if free parameters or frames reproduce its whole effect.
     effect : (r, P) displacements of the platform by the parameters, frames removed.
     """
     table = machine.parameters
@@ -215,7 +212,7 @@ def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], 
     q, s, _ = np.linalg.svd(free, full_matrices=False)
     q = q[:, nonzero(s)]
     residual = held - q @ (q.T @ held)
-    # a parameter's metre moves joints by about a metre, so the threshold is absolute
+    # displacements are about as large as changes of the parameters, so the threshold is absolute
     alone = np.linalg.norm(residual, axis=0) < CONVENTION_NULL_SHARE
     names = tuple(name for name, is_alone in zip(table.fixed, alone, strict=True) if is_alone)
     others = residual[:, ~alone]
@@ -228,7 +225,7 @@ def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], 
 
 
 class _Open(NamedTuple):
-    """Open space, in prior sigmas.
+    """Space of changes that the data do not determine, in prior sigmas.
 
     rows : (n, P) orthonormal basis.
     covariance : (n, n) posterior in that basis.
@@ -249,8 +246,8 @@ def describe(
 
     null : (n, P) changes of all parameters in their units, any basis.
     information : (n,) singular values of the data's information on each direction, in units of the
-    prior, 0 by default: from ``UnidentifiedOptions.weak`` on the sentence is that the nominal model
-    knows it better, not that it is free.
+        prior, 0 by default. From ``UnidentifiedOptions.weak`` on, the sentence states that the
+        nominal model determines the direction better; below, that it is free.
     effect : (r, P) as returned by :func:`platform_by_parameters`.
     """
     space = _open(around, null, information)
@@ -266,7 +263,9 @@ def describe(
 
 
 def _open(around: Situation, null: Array, information: Array | None) -> _Open:
-    """Open space in prior sigmas, without frames and, where no image shows them, without tubes."""
+    """Undetermined space in prior sigmas, without frames and, without images, without the tubes'
+    radii.
+    """
     space = _open_with_tubes(around.machine, null, information)
     if around.imaged or not len(space.rows):
         return space
@@ -276,8 +275,8 @@ def _open(around: Situation, null: Array, information: Array | None) -> _Open:
 
 
 def _shifts(space: _Open, effect: Array) -> Array:
-    """Displacements (n,) of the platform by independent changes in the open space, one standard
-    deviation of their posterior each, m.
+    """Displacements (n,) of the platform by independent changes in the undetermined space, each one
+    posterior standard deviation, m.
     """
     root = np.linalg.cholesky(space.covariance)
     shifts = np.linalg.svd(effect @ (space.unit[:, None] * (space.rows.T @ root)), compute_uv=False)
@@ -285,11 +284,13 @@ def _shifts(space: _Open, effect: Array) -> Array:
 
 
 def _open_with_tubes(machine: Machine, null: Array, information: Array | None) -> _Open:
-    """Open space in prior sigmas, frames removed."""
+    """Undetermined space in prior sigmas, frames removed."""
+    # prior sigmas
     squares = machine.parameters.free_matrix() ** 2
     # tied parameters share one deviation
     shared = np.where(squares.sum(axis=1) > 0, squares @ squares.sum(axis=0), 1.0)
     unit = machine.parameters.tolerance * np.sqrt(np.maximum(shared, 1.0))
+    # changes without frames, each of length one
     shifted = generators(machine.layout, machine.values) @ freedoms(machine)
     frames = _orthonormal((shifted / unit[:, None]).T).T
     rows = null / unit
@@ -314,7 +315,9 @@ def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
 
 
 def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
-    """Motions that lie in the open space, each with the part that it is the first to explain."""
+    """Motions that lie in the undetermined space, each with the part that no earlier motion
+    explains.
+    """
     parts: list[OpenMotion] = []
     options = around.options
     done = np.zeros((0, space.rows.shape[1]))
@@ -345,7 +348,9 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
 
 
 def _without(space: _Open, directions: Array) -> _Open:
-    """Open space without changes (k, P) in it, which are treated as frame changes."""
+    """Undetermined space without the changes (k, P), which are treated as frame changes from now
+    on.
+    """
     complement = np.linalg.svd(space.rows @ directions.T)[0][:, len(directions) :].T
     frames = np.concatenate([space.frames, directions.T], axis=1)
     return _Open(
@@ -365,8 +370,10 @@ def _directions(rows: Array, options: UnidentifiedOptions) -> Array:
 
 
 def _cosines(changes: Array, space: _Open) -> tuple[Array, Array]:
-    """Principal directions (n, n), as columns in the open space's basis, and their cosines (n,)
-    with the space of changes (P, m).
+    """Principal angles between the undetermined space and a space of changes (P, m).
+
+    Returns the principal directions (n, n), as columns in the basis of the undetermined space, and
+    the cosines (n,) of their angles.
     """
     columns = (changes / space.unit[:, None]).T
     size = np.linalg.norm(columns, axis=1)
@@ -380,10 +387,9 @@ def _cosines(changes: Array, space: _Open) -> tuple[Array, Array]:
 
 
 def _within(cosines: tuple[Array, Array], space: _Open, inside: float) -> Array:
-    """Orthonormal directions (k, P) of the open space that changes can make.
+    """Orthonormal directions (k, P) of the undetermined space that lie in a space of changes.
 
-    cosines : of the changes, by :func:`_cosines`.
-    inside : least squared cosine between such a direction and the changes.
+    cosines : of the changes, by :func:`_cosines`. inside : least squared cosine.
     """
     directions, cosine = cosines
     return directions[:, cosine**2 > inside].T @ space.rows
@@ -394,8 +400,9 @@ def _coefficients(
 ) -> Array:
     """Coefficients (k, m) of a motion for directions ``values`` (k, P), frames excluded.
 
-    Frames leave a choice. Of a single change the coefficients with the smallest sum of magnitudes
-    are taken, by iteratively reweighted least squares, so that a sentence has few numbers.
+    The coefficients are not unique, since frame changes may be added. For a single change those
+    with the smallest L1 norm are taken, by iteratively reweighted least squares, so that a sentence
+    has few numbers.
     """
     columns = motion.columns / space.unit[:, None]
     scale = np.linalg.norm(columns, axis=0)
@@ -422,7 +429,9 @@ def _merged(around: Situation, parts: list[OpenMotion]) -> list[OpenMotion]:
 
 
 def _with_last_leg(part: OpenMotion, parts: list[OpenMotion]) -> OpenMotion:
-    """Add the last leg to sizes of all legs but one, where their common part is described as
+    """Add the last leg to a part on sizes of all legs but one.
+
+    If the common part of all legs is described too, the sizes of the last leg are undetermined as
     well.
     """
     same = [p.legs for p in parts if p.motion.labels == part.motion.labels and len(p.legs) > 1]
@@ -433,7 +442,7 @@ def _with_last_leg(part: OpenMotion, parts: list[OpenMotion]) -> OpenMotion:
 
 
 def _moves(around: Situation, part: OpenMotion, space: _Open, effect: Array) -> tuple[float, bool]:
-    """Displacement of the platform by a motion, m, and whether the data contain information about
+    """Displacement of the platform by a motion, m, and whether the data contain information on
     it.
     """
     value = _directions(part.space, around.options)

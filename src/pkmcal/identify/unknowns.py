@@ -1,6 +1,6 @@
 """Unknowns of the joint estimate: their names, their columns, and their values in B runs.
 
-The shared unknowns stand in this order of columns:
+The shared unknowns have this order of columns:
 
 - **machine** : free combinations z of its parameters, ``theta = nominal + free z``.
 - **stations** : left perturbation (omega, tau) of each T_camera_base.
@@ -10,7 +10,7 @@ The shared unknowns stand in this order of columns:
 - **linked** : the own unknowns, see below, of each configuration that a measurement links to
   another: the rows of both depend on them.
 
-Each other configuration has unknowns of its own, nuisance parameters that are eliminated first: the
+Each other configuration has own unknowns, nuisance parameters that are eliminated first: the
 platform's motion (left perturbation of T_base_platform, along the directions that the machine has)
 and, on an articulated platform, its hinges
 (:attr:`~pkmcal.mechanisms.layout.LimbLayout.own_motion`).
@@ -28,10 +28,11 @@ from pkmcal.arrays import Array, Integers
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Numbers of the shared unknowns, and the columns where they stand.
+    """Numbers of the shared unknowns, and their columns.
 
-    n_free : of the machine. codes : of the effects, in their order, each with the number of its
-    columns. n_linked : own unknowns of all linked configurations together.
+    n_free : free unknowns of the machine.
+    codes : codes of the effects in their order, each with its number of columns.
+    n_linked : own unknowns of all linked configurations together.
     """
 
     n_free: int
@@ -81,8 +82,9 @@ class Unknowns:
         return self.linked.stop
 
     def columns(self, *names: str) -> Integers:
-        """Columns of the named unknowns in increasing order. names : machine, stations, mounts,
-        linked, or codes of effects.
+        """Columns of the named unknowns in increasing order.
+
+        names : machine, stations, mounts, linked, or codes of effects.
         """
         parts = [getattr(self, n) if n in PARTS else self.of_code(n) for n in names]
         none = np.zeros(0, dtype=int)
@@ -90,7 +92,7 @@ class Unknowns:
 
 
 PARTS = ("machine", "stations", "mounts", "linked")
-"""Names of the unknowns that are no effects."""
+"""Names of the unknowns other than effects."""
 
 
 def own_blocks(matrix: Array, part: slice, width: int) -> Array:
@@ -104,11 +106,16 @@ def own_blocks(matrix: Array, part: slice, width: int) -> Array:
 
 @dataclass(frozen=True)
 class BatchState:
-    """Values of the unknowns in B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
-    T_base_platform (B, K, 4, 4), columns (B, n) numbers of the effects, T_mount (B, M, 4, 4) of
-    boards, internal (B, K, n) of articulated platforms. linked : (B, J, 4, 4) T_base_platform of
-    the linked configurations, in the state of some configurations only; else none, for
-    T_base_platform has them.
+    """Values of the unknowns in B runs.
+
+    z : (B, nz) free parameters.
+    T_camera_base : (B, S, 4, 4).
+    T_base_platform : (B, K, 4, 4).
+    columns : (B, n) numbers of the effects.
+    T_mount : (B, M, 4, 4) boards and targets.
+    internal : (B, K, n) hinges of articulated platforms.
+    linked : (B, J, 4, 4) T_base_platform of the linked configurations, in the state of some of the
+        configurations; otherwise empty, since T_base_platform contains them.
     """
 
     z: Array

@@ -38,50 +38,51 @@ if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
 
 POLISHED_SHADING = 4 * OWN_SHADING
-"""Shading of each edge beside its line, px, from which on tubes are like polished metal or in hard
-light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted ones."""
+"""Shading of each edge in addition to its line, px, above which tubes look like polished metal, or
+are in hard light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted
+ones."""
 POOR_MODEL_POSE_SCALE = 1.3
-"""Noise scale of poses beyond which the model is insufficient for them, unless by chance."""
+"""Noise scale of poses above which the model is insufficient, if the scale is significant."""
 
 
 @dataclass(frozen=True)
 class VerdictOptions:
     """Limits of a result that may be used."""
 
-    # noise scale beyond which the model does not explain the images, or the poses
+    # noise scale of edges or poses above which the model does not explain them
     too_noisy: float = 4.0
     # share of rejected edges beyond which the remaining ones may be the outliers
     too_many_rejected: float = 0.4
-    # share of the platform's error by the nominal model that may remain undetermined. A calibration
-    # reduces that error by a factor of twenty to fifty; a twentieth of it would be the result's
-    # largest error, and more of the same images do not reduce it
+    # limit of the undetermined part of the platform's error by the nominal model. A calibration
+    # reduces that error by a factor of twenty to fifty; an undetermined twentieth would be the
+    # largest error of the result, and more images of the same kind do not reduce it
     undetermined_share: float = 0.05
-    # share of the platform's variance by the noise of the data from which that is no reason: the
-    # result is hardly worse for it. More of the same images reduce noise alone
+    # share of the platform's variance due to noise above which the undetermined part is accepted,
+    # since it hardly increases the standard deviation
     least_noise_share: float = FEW
-    # share of the platform's standard deviation from which on a single undetermined motion is worth
-    # a warning: one half makes the standard deviation larger by an eighth
+    # displacement by one undetermined motion, relative to the platform's standard deviation, that
+    # causes a warning: one half increases the standard deviation by an eighth
     worth_reporting: float = 0.5
-    # share of configurations near a singular pose from which on the estimate is not reliable
+    # share of configurations near a singular pose above which the estimate is not reliable
     singular_share: float = MAJORITY
-    # share of what is undetermined from which on a single cause becomes a reason of its own
+    # share of the undetermined displacement above which one motion is a reason of its own
     large_cause_share: float = CAUSE_SHARE
-    # error relative to that expected by the prior sigmas that a result may leave: below a half the
-    # result is almost surely better than the nominal model; above, new values are not worth their
-    # risk
+    # limit of the result's standard deviation relative to that by the prior sigmas: below a half
+    # the result is almost surely better than the nominal model; above, new values are not worth
+    # their risk
     nominal_error_share: float = 0.5
-    # residual of a reading, in standard deviations, beyond which it contradicts the images, and the
-    # share of such readings that is a reason: two in a billion normal errors are so large
+    # residual of a reading, in standard deviations, above which it contradicts the images (two in a
+    # billion normal errors are so large), and the share of such readings that is a reason
     reading_residual: float = 6.0
     contradicted_share: float = 0.02
-    # edges of a leg, relative to the median of all legs, below which the leg is seldom in view
+    # number of a leg's edges, relative to the median of all legs, below which it is seldom in view
     few_edges_share: float = FEW
-    # factor on the edges' stated noise that is worth a warning: the standard deviations contain it
+    # factor on the edges' stated noise that causes a warning; the standard deviations contain it
     edge_scatter: float = NOISE_EXCESS
-    # configurations below which a note says that they are few
+    # number of configurations below which a note is added
     few_configurations: int = 10
-    # heights of a bed, where a wrong one moves the tool by little more than its standard deviation
-    # before it is detected (benchmarks/heights.py)
+    # number of heights of a bed with which a wrong height is detected before it moves the tool by
+    # much more than its standard deviation (benchmarks/heights.py)
     enough_touches: int = 15
 
 
@@ -90,7 +91,7 @@ VERDICT = VerdictOptions()
 
 @dataclass(frozen=True)
 class RicherModel:
-    """Another model of the mechanism file, which explains the poses.
+    """Another model of the mechanism file that explains the poses.
 
     scale : noise scale of the poses with it.
     """
@@ -113,15 +114,16 @@ def assess(
 ) -> Verdict:
     """Verdict on an estimate of a session.
 
-    identification : what the data determine of the machine, and what they leave unidentified.
-    richer : the model of the machine that explains the poses, where this one is insufficient.
-    explained : whether the model discrepancy surely explains the scatter of heights; the standard
-    deviations then contain it.
+    identification : directions of the machine that the data determine, and those that they do not.
+    richer : model of the machine that explains the poses, where the estimated one is insufficient.
+    explained : whether a significant model discrepancy explains the scatter of heights; the
+        standard deviations then contain it.
     others : findings of any level about the session.
     joints : (K, m) readings; by default those at which the calibrated machine takes the poses.
     """
     bed = identification.bed
-    # what the data leave undetermined, then what they determine no better than the nominal model
+    # undetermined motions; and, if these are no refusal, whether the result improves on the
+    # nominal model
     undetermined = () if bed else tuple(_undetermined(estimate, identification, options))
     refused = any(one.level is Level.WRONG for one in undetermined)
     no_better: tuple[Finding, ...] = ()
@@ -163,8 +165,8 @@ def assess(
 def _headline(estimate: Estimate, joints: Array | None) -> str:
     """Tool error of the nominal and of the calibrated machine, means over the poses in use.
 
-    Before, the distance of the nominal model's pose from the calibrated one at the same readings;
-    after, the standard deviation.
+    For the nominal model, the distance of its pose from the calibrated one at the same readings;
+    for the calibrated machine, the standard deviation.
     """
     machine = estimate.machine
     nominal = machine.with_values(machine.parameters.nominal)
@@ -194,10 +196,10 @@ def _headline(estimate: Estimate, joints: Array | None) -> str:
 
 
 def no_gain(sigma: float, nominal_sigma: float, options: VerdictOptions = VERDICT) -> bool:
-    """Whether a result is no better than the nominal model, for data of any kind.
+    """Whether a result is no better than the nominal model.
 
-    sigma : standard deviation of the purpose of the result (the platform at given readings, or the
-    tool's height above the bed).
+    sigma : standard deviation of the platform at given readings, or of the tool's height above the
+        bed.
     nominal_sigma : the same by the prior sigmas alone, in the same unit.
     """
     return not sigma <= options.nominal_error_share * nominal_sigma
@@ -206,14 +208,16 @@ def no_gain(sigma: float, nominal_sigma: float, options: VerdictOptions = VERDIC
 def _no_gain(
     subject: str, sigma: float, nominal_sigma: float, options: VerdictOptions
 ) -> Iterator[Finding]:
-    """Wrong if the measurements do not improve on the nominal model; see :func:`no_gain`."""
+    """Refusal if the measurements do not improve on the nominal model; see :func:`no_gain`."""
     if no_gain(sigma, nominal_sigma, options):
         yield wrong(f"{subject}.no_gain", sigma=sigma, nominal_sigma=nominal_sigma)
 
 
 def _touch_unnoticed(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:
-    """Doubtful if one undetected wrong height has a large effect: no standard deviation contains
-    it, since the size of such an error, of a crumb for example, is unknown.
+    """Warning if one undetected wrong height has a large effect.
+
+    No standard deviation contains the effect, since the size of such an error (a crumb, for
+    example) is unknown.
     """
     if bed.unnoticed is None or no_gain(bed.unnoticed, bed.by_drawing, options):
         yield doubtful(
@@ -228,7 +232,7 @@ def _touch_unnoticed(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:
 def _not_by_heights(
     bed: Bed, identification: Identification, negligible: float
 ) -> Iterator[Finding]:
-    """Notes on what heights leave to the nominal model, and on its largest cause.
+    """Notes on directions that heights do not determine, and on the largest one.
 
     negligible : displacement of the platform, m.
     """
@@ -254,12 +258,14 @@ def _estimate_misfit(estimate: Estimate, method: str, options: VerdictOptions) -
     rejected = (
         float(np.mean(estimate.edge_weights < INLIER_WEIGHT)) if estimate.edge_weights.size else 0.0
     )
+    # edges
     if s.noise_scale > options.too_noisy and method != "bundle":
         yield wrong("estimate.method_misfit", method=method, scale=s.noise_scale)
     elif s.noise_scale > options.too_noisy:
         yield wrong("edges.misfit", scale=s.noise_scale)
     if rejected > options.too_many_rejected:
         yield wrong("edges.rejected_share", share=rejected, limit=options.too_many_rejected)
+    # the estimate itself
     if s.dof <= 0:
         yield wrong("estimate.no_redundancy", dof=s.dof)
     if s.stopped == Stop.STEPS.value:
@@ -284,10 +290,10 @@ def _readings_misfit(estimate: Estimate, options: VerdictOptions) -> Iterator[Fi
 
 
 def _base_alone(estimate: Estimate) -> Finding:
-    """Finding on [B]'s linear method, which determines the base only, and on its accuracy.
+    """Finding on [B]'s linear method, which determines the base only, with its accuracy.
 
-    The variance by the edges alone is found by removing the prior: in units of the prior's
-    principal axes, the posterior has the variance v = e / (1 + e) where the edges' is e.
+    The variance due to the edges alone follows by removing the prior: in units of the prior's
+    principal axes, the posterior variance is v = e / (1 + e) for an edge variance e.
     """
     machine, table = estimate.machine, estimate.machine.parameters
     nominal = machine.with_values(table.nominal)
@@ -315,8 +321,10 @@ def _base_alone(estimate: Estimate) -> Finding:
 def _poses_misfit(
     estimate: Estimate, richer: RicherModel | None, options: VerdictOptions
 ) -> Iterator[Finding]:
-    """Findings on poses that the model does not explain, of which many are rejected, or that
-    scatter more than stated; with the richer model that explains them.
+    """Findings on poses that the model does not explain: noise scale too large, too many rejected,
+    or more scatter than stated.
+
+    richer : model that explains the poses, for the message.
     """
     s = estimate.statistics
     better = {"model": richer and richer.name, "model_scale": richer and richer.scale}
@@ -332,13 +340,13 @@ def _poses_misfit(
 
 
 def usual_scale(dof: float) -> float:
-    """Largest noise scale of poses, or of what links them, that is no reason for a report."""
+    """Largest noise scale of poses, or of links, that causes no finding."""
     return max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(Search.POSE_NOISE, dof))
 
 
 def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
-    """Wrong if most poses are singular: small errors then move the platform far, and no
-    linearization holds.
+    """Refusal if most poses are near-singular: small errors then move the platform far, and
+    linearization does not hold.
     """
     machine = estimate.machine
     poses = estimate.state.T_base_platform[estimate.configurations]
@@ -350,11 +358,11 @@ def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
 def _undetermined(
     estimate: Estimate, identification: Identification, options: VerdictOptions
 ) -> Iterator[Finding]:
-    """Findings on the largest motions that the data leave undetermined.
+    """Findings on the largest motions that the data do not determine.
 
-    They are wrong by the displacement of the tool by all such errors together, where these make
-    most of its variance, so that no refusal depends on the names of motions; otherwise doubtful
-    where a single motion makes a noticeable part of its standard deviation.
+    They are a refusal if all such errors together make most of the tool's variance, so that no
+    refusal depends on the names of motions; otherwise a warning for each single motion that makes a
+    noticeable part of the standard deviation.
     """
     shift, sigma = identification.undetermined_shift, platform_sigma(estimate)
     if shift <= negligible_shift(estimate.machine.parameters):
@@ -387,7 +395,7 @@ def _undetermined(
 
 
 def _harmless(identification: Identification) -> Iterator[Finding]:
-    """One note on unidentified motions that do not move the platform; the report has the
+    """One note on unidentified motions that do not move the platform; the report contains the
     sentences.
     """
     if not identification.n_harmless:
@@ -411,10 +419,10 @@ def _harmless(identification: Identification) -> Iterator[Finding]:
 def _warnings(
     observation: Observation, estimate: Estimate, options: VerdictOptions
 ) -> Iterator[Finding]:
-    """Findings on values far from the nominal model, and on what increases standard deviations."""
+    """Warnings on values far from the nominal model, and on causes of large standard deviations."""
     table = estimate.machine.parameters
     change = np.abs(_from_nominal(estimate.machine))
-    # a person should check these values
+    # values to be checked by a person
     far = [table.names[k] for k in np.argsort(-change) if change[k] > CONTRADICTION_SIGMAS]
     if far:
         yield doubtful(
@@ -424,6 +432,7 @@ def _warnings(
             tolerances=CONTRADICTION_SIGMAS,
             most=float(change.max()),
         )
+    # edges: legs seldom in view, scatter, shading
     in_view = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
     for leg in np.flatnonzero(in_view < options.few_edges_share * np.median(in_view)).tolist():
         yield doubtful("edges.leg_seldom_seen", f"leg {leg + 1}", leg=leg + 1)
@@ -435,9 +444,10 @@ def _warnings(
 
 
 def _from_nominal(machine: Machine) -> Array:
-    """Changes (P,) of the parameters in prior sigmas, in the frames that make them least.
+    """Changes (P,) of the parameters in prior sigmas, in the frames that minimize them.
 
-    Frames by three joints would add these joints' errors to all other parameters, axes above all.
+    Frames defined by three joints would add these joints' errors to all other parameters, mainly
+    axes.
     """
     table = machine.parameters
     change = (machine.values - table.nominal) / table.tolerance

@@ -21,11 +21,12 @@ WITHIN_TRUTH_SIGMAS = 2.0
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of a machine with respect to the true one, after registration of the frames: m and
+    """Errors of a machine with respect to the true one, after registration of the frames; m and
     rad.
 
-    centre : mean distance of the joint centres. offset : root mean square. position, orientation :
-    mean error of the platform's pose at the session's readings.
+    centre : mean distance of the joint centres.
+    offset : root mean square error of the readings' offsets.
+    position, orientation : mean errors of the platform's pose at the session's readings.
     """
 
     centre: float

@@ -1,7 +1,8 @@
 """Difference between two cameras: pixels of the same far points, after the best rotation.
 
-A calibration determines a camera only up to a rotation of its frame: a principal point that moves
-is almost a camera that turns. Rays of A are rotated such that B's pixels of them differ least.
+A calibration determines a camera only up to a rotation of its frame: a shift of the principal point
+is almost a rotation of the camera. So the rays of A are rotated such that their pixels in B differ
+least from those in A.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from pkmcal.wording import brief
 CAMERA_CELLS = (32, 24)
 """Columns and rows of cells in which two cameras are compared."""
 ROTATION_STEPS = 50
-"""Most Gauss-Newton steps for the best rotation; two or three suffice for equal lenses."""
+"""Maximum number of Gauss-Newton steps for the best rotation; two or three suffice for equal
+lenses."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,12 @@ class ComparedCamera:
 class CameraDifference:
     """Difference between two cameras.
 
-    rotation : (3, 3) of A's rays into B's frame. pixels : (rows, columns, 2) of A, middles of
-    cells. difference : (rows, columns, 2) px, B's pixel minus A's; NaN where one has no ray. sigma
-    : (rows, columns) px, of the difference by chance in the worst direction; None if neither file
-    has a covariance. chance : p-value of as large a difference; None without sigma.
+    rotation : (3, 3) from A's rays to B's frame.
+    pixels : (rows, columns, 2) of A, middles of cells.
+    difference : (rows, columns, 2) px, B's pixel minus A's; NaN where one has no ray.
+    sigma : (rows, columns) px, standard deviation of the difference in the worst direction; None if
+        neither file has a covariance.
+    chance : p-value of the difference; None without sigma.
     """
 
     a: ComparedCamera
@@ -140,9 +144,9 @@ def camera_difference(a: Camera | Path | str, b: Camera | Path | str) -> CameraD
 
 
 def best_rotation(camera: Camera, rays: Array, pixels: Array, weight: Array) -> Array:
-    """Rotation (3, 3) by which rays (n, 3) have pixels (n, 2) in a camera, by least squares.
+    """Rotation (3, 3) after which rays (n, 3) have pixels (n, 2) in a camera, by least squares.
 
-    weight : (n,) one over the standard deviation.
+    weight : (n,) inverse standard deviations.
     """
     R = np.eye(3)
     for _ in range(ROTATION_STEPS):
@@ -170,8 +174,9 @@ def _by_rotation(camera: Camera, rays: Array) -> Array:
 
 
 def _spread(a: Camera, b: Camera, pixels: Array, rays: Array, R: Array) -> Array:
-    """Root (n, 2, m) of the covariance of B's pixels by A's parameters, which move the rays, and
-    by B's; zero for a camera without a covariance.
+    """Root (n, 2, m) of the covariance of B's pixels due to the parameters of both cameras.
+
+    A's parameters change the rays. Zero for a camera without a covariance.
     """
     by_ray, by_b = b.project_jacobians(rays @ R.T)
     parts: list[Array] = []
@@ -184,7 +189,7 @@ def _spread(a: Camera, b: Camera, pixels: Array, rays: Array, R: Array) -> Array
 
 
 def _without_rotation(spread: Array, camera: Camera, rays: Array, weight: Array) -> Array:
-    """Columns of changes (n, 2, m) without the part that the best rotation takes away."""
+    """Columns of changes (n, 2, m), projected orthogonally to the effect of a rotation."""
     w = weight[:, None, None]
     basis = np.linalg.qr((w * _by_rotation(camera, rays)).reshape(-1, 3))[0]
     flat = (w * spread).reshape(-1, spread.shape[-1])
@@ -192,10 +197,11 @@ def _without_rotation(spread: Array, camera: Camera, rays: Array, weight: Array)
 
 
 def _p_value(off: Array, spread: Array, weight: Array) -> float:
-    """Probability of as large a weighted sum of squares of differences (n, 2) by chance.
+    """P-value of the weighted sum of squared differences (n, 2).
 
-    The sum is one of chi-squares weighted by eigenvalues; a scaled chi-square with the same mean
-    and variance takes its place (Satterthwaite). spread : (n, 2, m) root of the covariance.
+    The sum is distributed as chi-squares weighted by eigenvalues, which is approximated by a scaled
+    chi-square with the same mean and variance (Satterthwaite). spread : (n, 2, m) root of the
+    covariance.
     """
     from scipy.special import gammaincc
 

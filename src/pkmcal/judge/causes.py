@@ -1,8 +1,9 @@
 """Causes of a change as directions of the machine's parameters: legs, their parts, thermal
 expansion.
 
-They include the magnification of a camera. Focus, temperature and touching a lens change the focal
-length first; its effect on edges and boards is not that of a machine, but partly looks like one.
+The magnification of a camera is one of them. Focus, temperature and touching a lens change the
+focal length first; its effect on edges and boards differs from that of a machine, but is correlated
+with it.
 """
 
 from __future__ import annotations
@@ -25,19 +26,23 @@ from pkmcal.wording import split_name
 JointSide = Literal["base", "platform"]
 JOINT_SIDES: tuple[JointSide, JointSide] = ("base", "platform")
 COMMON_MOUNT_RATIO = 0.7
-"""Distance of two joints on a common mount, relative to that of the next joint, at most."""
+"""Maximum distance of two joints on a common mount, relative to the distance of the next joint."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """Possible change of the machine or its cameras.
+    """Possible change of the machine or its cameras, by k numbers.
 
     part : of a leg (:class:`~pkmcal.mechanisms.ParameterTable`), or ``all``, ``scale``, ``camera``,
-    ``station``. columns : (P, k), change of the machine's parameters (m, rad) by k numbers; or (P +
-    C, k), with the cameras' magnifications; or for all columns of
-    :class:`~pkmcal.judge.fixed_machine.Evidence`. sizes : (k,) their typical values: a prior sigma,
-    USUAL_RATIO_CHANGE, or USUAL_STATION_MOVE. legs : from 0. unit : of the k numbers: m, rad, or
-    empty for a ratio. camera, station : indices in the session.
+        ``station``.
+    columns : (P, k) derivative of the machine's parameters (m, rad) by the numbers; (P + C, k) with
+        the magnifications of C cameras; or all columns of
+        :class:`~pkmcal.judge.fixed_machine.Evidence`.
+    sizes : (k,) typical values of the numbers: a prior sigma, USUAL_RATIO_CHANGE, or
+        USUAL_STATION_MOVE.
+    legs : from 0.
+    unit : of the numbers: m, rad, or empty for a ratio.
+    camera, station : indices in the session.
     """
 
     part: str

@@ -63,8 +63,10 @@ class ObservableCause(NamedTuple):
 class Change:
     """Estimate of a cause's k numbers, if nothing else has changed.
 
-    value, sigma : (k,) m, rad or a ratio. covariance : (k, k). Unobservable numbers are zero with
-    an infinite sigma.
+    value, sigma : (k,) m, rad or a ratio.
+    covariance : (k, k).
+
+    Unobservable numbers are zero with an infinite sigma.
     """
 
     value: Array
@@ -111,7 +113,7 @@ def twice_log_odds(evidence: Evidence, cause: Cause) -> float:
 class CommonLevel:
     """Joint significance of several tests on the same data.
 
-    least : (WATCH_NOISE_DRAWS,) least p-value of all tests in each draw of pure noise, sorted.
+    least : (WATCH_NOISE_DRAWS,) smallest p-value of all tests in each draw of pure noise, sorted.
     count : number of tests with observable directions.
     """
 
@@ -167,9 +169,10 @@ def change(evidence: Evidence, cause: Cause) -> Change:
 
 
 def detectable(evidence: Evidence, tester: Cause, along: Array, level: float) -> float:
-    """Smallest change along a direction that a test at a level detects with DETECTION_POWER.
+    """Smallest change along a direction that a test detects with DETECTION_POWER; inf if
+    unobservable.
 
-    along : (P,) change of the parameters by one unit (m, rad). inf if it is not observable.
+    along : (P,) change of the parameters by one unit (m, rad). level : of the test.
     """
     from scipy.special import chdtri, chndtrinc
 
@@ -198,11 +201,14 @@ def detectable_range(
 class LegTest:
     """Tests of one leg, or of the legs of one motor.
 
-    legs : from 0. whole : test of all parameters except those of the tubes. zero : test of the
-    reading's zero, change : its estimate, if nothing else has changed; None for a leg without a
-    reading. unit, tolerance : of that zero. detects_zero : smallest change of it (m or rad) that is
-    detected with DETECTION_POWER. detects_base, detects_platform : the same for the joints (m), in
-    the most and the least observable direction.
+    legs : from 0.
+    whole : test of all parameters except those of the tubes.
+    zero, change : test of the reading's zero, and its estimate if nothing else has changed; None
+        for a leg without a reading.
+    unit, tolerance : unit and prior sigma of that zero.
+    detects_zero : smallest change of the zero (m or rad) that is detected with DETECTION_POWER.
+    detects_base, detects_platform : smallest detectable displacements of the joints (m), in the
+        most and in the least observable direction.
     """
 
     legs: tuple[int, ...]
@@ -243,8 +249,9 @@ class LegTest:
 class StationTest:
     """Test of whether a camera that is assumed to be unmoved has moved.
 
-    station : index in the session. change : (phi, s) along the camera's axes, if nothing else has
-    changed.
+    station : index in the session.
+    test : score test.
+    change : (phi, s) along the camera's axes, if nothing else has changed.
     """
 
     station: int
@@ -254,7 +261,7 @@ class StationTest:
 
 @dataclass(frozen=True)
 class Suspect:
-    """Cause with the estimate of its change. chi2 : part of chi-square that it explains."""
+    """Cause with the estimate of its change. chi2 : decrease of chi2 by the cause."""
 
     cause: Cause
     change: Change
@@ -280,10 +287,10 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Most likely cause, given the other identified ones.
+    """Most likely cause, given the other identified causes.
 
-    test : of what it explains. others : causes that the data do not distinguish from it, best
-    first.
+    test : score test of the cause.
+    others : causes that the data do not distinguish from it, best first.
     """
 
     suspect: Suspect
@@ -295,11 +302,14 @@ class Explanation:
 class ChangeTests:
     """All tests for a change.
 
-    machine : of the numbers of all legs together. scale : of a common scale of all lengths.
-    stations : of each camera that is assumed to be unmoved. alpha : false-alarm rate of all tests
-    together. level : of a single test, for that rate. rest : ``machine`` without what the findings
-    explain. another_machine : whether a change of all numbers, of their tolerances' size, makes the
-    data a hundred times as likely as a few causes do; these are then not among the findings.
+    machine : score test of all parameters of all legs.
+    scale : score test of a common scale of all lengths.
+    stations : tests of each camera that is assumed to be unmoved.
+    alpha : family-wise false-alarm rate of all tests.
+    level : level of a single test for that rate.
+    rest : ``machine``, given the causes that were identified.
+    another_machine : whether a change of all parameters within their prior sigmas makes the data a
+        hundred times as likely as a few causes do; these are then not among the findings.
     """
 
     legs: tuple[LegTest, ...]
@@ -367,8 +377,8 @@ def made_tests(
 ) -> tuple[tuple[Score, ...], tuple[Score | None, ...], CommonLevel]:
     """All tests on new data, with p-values adjusted for their number, and their joint significance.
 
-    First those of all legs, of a common scale, of each arm's legs, and of each camera that was left
-    in place; then those of each arm's zero, None for an arm without one.
+    First the tests of all legs, of a common scale, of each arm's legs, and of each camera that was
+    left in place; then those of each arm's zero, None for an arm without one.
     """
     causes = [whole_machine(machine), common_scale(machine), *whole_legs(machine)]
     causes += stations_moved(evidence)
@@ -450,9 +460,9 @@ def _leg_test(
 
 
 def explained(evidence: Evidence, causes: Sequence[Cause], alpha: float) -> tuple[Explanation, ...]:
-    """Causes identified one after the other, each the most likely given those before.
+    """Identify causes by forward selection, each the most likely given those before.
 
-    Each must explain more than the best of so many would by chance. The first cause found for two
+    Each must explain more than the best of so many causes would by chance. The first cause of two
     changes may be one that resembles both; so with two causes all pairs are tried, and after each
     further cause the earlier ones are reconsidered.
     """
@@ -508,7 +518,7 @@ def _explanation(
     """
     own, others = chosen[place], chosen[:place] + chosen[place + 1 :]
     rest = _project_out(evidence, others)
-    # a cause that explains no more than no change at all is no rival, however weak the best is
+    # a cause that is no more likely than no change at all is no rival
     nothing = twice_log_odds(evidence, joined_causes(others)) if others else 0.0
     least = max(twice_log_odds(evidence, joined_causes(chosen)) - DISTINCT_LOG_ODDS, nothing)
     near = [c for score, c in _rank(evidence, others, causes) if score > least and c is not own]

@@ -45,12 +45,15 @@ class Ratio:
 class Promise:
     """Test of residuals against the standard deviations by calibration and images.
 
-    chi2, dof, chance : of all residuals. factor : root mean square ratio of residuals to standard
-    deviations. common : (m,) common offset of each reading in all configurations, m or rad.
-    common_sigma : (m,) its standard deviation. common_chance : p-value of all offsets being zero.
+    chi2, dof, chance : of all residuals.
+    factor : root mean square ratio of residuals to standard deviations.
+    common : (m,) common offset of each reading in all configurations, m or rad.
+    common_sigma : (m,) standard deviation of the common offset.
+    common_chance : p-value of all common offsets being zero.
     usual, steady : whether the residuals, and their common offsets, agree with the standard
-    deviations times NOISE_EXCESS. expected : (n, m) standard deviations of the
-    residuals, m or rad. by_noise : (n, m) those by the noise of images and readings alone.
+        deviations times NOISE_EXCESS.
+    expected : (n, m) standard deviations of the residuals, m or rad.
+    by_noise : (n, m) standard deviations due to the noise of images and readings alone.
     """
 
     chi2: float
@@ -94,11 +97,14 @@ class WeighedErrors:
 class NominalComparison:
     """Calibrated and nominal machine compared on n configurations.
 
-    rows : (n,) their indices. calibrated, nominal : errors of both machines. before, after : (n,)
-    root mean squares of each configuration's residuals by the nominal and by the calibrated
-    machine, weighted by their observability in the images (:class:`Weights`), m or rad. floor :
-    expected value by the noise of the images alone. ratio : of before to after. promise : test of
-    the residuals.
+    rows : (n,) indices of the configurations.
+    calibrated, nominal : errors of both machines.
+    before, after : (n,) root mean squares of each configuration's residuals by the nominal and by
+        the calibrated machine, weighted by their observability in the images (:class:`Weights`), m
+        or rad.
+    floor : expected root mean square due to the noise of the images alone.
+    ratio : ratio of before to after.
+    promise : test of the residuals.
     """
 
     rows: Integers
@@ -167,12 +173,12 @@ def compare_with_nominal(
     by_nominal: Prediction | None,
     rows: Integers,
 ) -> NominalComparison:
-    """Compare the prediction of the calibrated machine with the nominal machine on configurations
-    ``rows``.
+    """Compare the prediction of the calibrated machine with the nominal machine on configurations.
 
-    covariance : (P, P) of the calibrated machine. by_nominal : prediction of the nominal machine
-    itself. The nominal machine is evaluated at its own poses or at those of the calibrated one,
-    whichever suits it better; at the latter without ``by_nominal``.
+    covariance : (P, P) of the calibrated machine.
+    by_nominal : prediction of the nominal machine itself, if any. The nominal machine is evaluated
+        at its own poses or at those of the calibrated one, whichever suits it better.
+    rows : indices of the configurations.
     """
     observed = np.flatnonzero(prediction.observed)
     m = measurements.joints.shape[1]

@@ -52,12 +52,15 @@ class ComparedMachine:
 class MachineDifference:
     """Difference between two machines.
 
-    change : b minus a. chance : p-value of its chi-square for an unchanged machine; 1 between
-    nominal models. chances : (P,) p-values of each parameter's change, corrected for their number;
-    NaN without a standard deviation. centres : of base and platform, a's registered to b's. tool :
-    effect of the change on the tool over the workspace, as ``after`` of the map, or the reason why
-    there is no map. shared : number of configurations that both calibrations used. assumed :
-    assumptions, in sentences.
+    change : b minus a.
+    chance : p-value of its chi-square for an unchanged machine; 1 between nominal models.
+    chances : (P,) p-values of each parameter's change, corrected for their number; NaN without a
+        standard deviation.
+    centres : of base and platform, a's registered to b's.
+    tool : effect of the change on the tool over the workspace, as ``after`` of the map, or the
+        reason why there is no map.
+    shared : number of configurations that both calibrations used.
+    assumed : assumptions, in sentences.
     """
 
     a: ComparedMachine

@@ -3,12 +3,12 @@
 The machine's parameters are fixed; the platform's poses, stations, boards, edge shifts and shading
 are estimated. At that point the residuals y, in standard deviations, have the derivative A by the
 machine's parameters, and P is the projector that eliminates all other unknowns, the nuisance
-parameters. The truth is the calibrated values plus the calibration's error e, of covariance C, plus
-a change c; to first order
+parameters. The true parameters are the calibrated ones plus the calibration's error e, of
+covariance C, plus a change c; to first order
 
     -P y = P A (c + e) + P noise,      with noise of unit variance.
 
-From this follow the prediction of a configuration's readings by all other data
+This gives the prediction of a configuration's readings by all other data
 (:mod:`pkmcal.judge.prediction`), and the tests for a change c (:func:`change_evidence`).
 """
 
@@ -41,7 +41,7 @@ from pkmcal.wording import named
 USUAL_RATIO_CHANGE = 1e-3
 """Typical change of a magnification or another ratio, the scale of its observability."""
 USUAL_STATION_MOVE = 1e-2
-"""Typical motion of a camera, m and rad, as that of a tripod that someone ran into."""
+"""Typical motion of a camera, m and rad, such as that of a tripod that was bumped."""
 UNSCALED_NOISE = RowGroups(1.0, 1.0, 1.0)
 
 
@@ -49,10 +49,12 @@ UNSCALED_NOISE = RowGroups(1.0, 1.0, 1.0)
 class Trust:
     """Weights and noise of new data.
 
-    robust : IRLS weights (N,) of each kind. scale, readings : factors on the stated noise of each
-    kind and of readings. shading : px, its standard deviation. Weights come from an estimate with a
-    free machine: with a fixed one, a leg that has changed would be taken for errors of its edges,
-    and rejected.
+    robust : (N,) IRLS weights of each kind.
+    scale, readings : factors on the stated noise of each kind, and of readings.
+    shading : px, standard deviation of the lines' shading.
+
+    Weights come from an estimate with a free machine: with a fixed one, the edges of a changed leg
+    would be outliers and lose their weights.
     """
 
     robust: RowGroups[Array]
@@ -79,8 +81,8 @@ class Trust:
         (:meth:`~pkmcal.identify.estimate.Estimate.stated_edge_noise`).
 
         scale, readings : the calibration's factors on the stated noise, used where they are larger
-        than the estimate's own. The factor of readings is the estimate's own if its data contradict
-        their stated noise.
+            than the estimate's own. For readings the estimate's own factor is used if its data
+            contradict the stated noise.
         """
         own = estimate.statistics
         return cls(
@@ -103,9 +105,11 @@ class Trust:
 class Held:
     """Fit of new measurements with a fixed machine; see the module.
 
-    machine : with the tubes' radii estimated, if they were free. observed : (K,). problem, state :
-    with the final weights, and the solution. unknowns : names of the unknowns of a change: the
-    machine's parameters, and, as intrinsics, the cameras' magnifications.
+    machine : fixed machine; the tubes' radii are estimated if they were free.
+    observed : (K,) configurations with measurements.
+    problem, state : problem with the final weights, and its solution.
+    unknowns : names of the unknowns of a change: the machine's parameters, and the cameras'
+        magnifications (as intrinsics).
     """
 
     machine: Machine
@@ -130,8 +134,9 @@ class Held:
 
 
 def held_machine(machine: Machine, radii: bool) -> Machine:
-    """Machine with all parameters fixed, at its values as the nominal model. radii : leave the
-    tubes' radii free, because light and images influence them.
+    """Machine with all parameters fixed, with its values as the nominal model.
+
+    radii : leave the tubes' radii free, because they depend on light and images.
     """
     table = machine.parameters
     free = {n for n, kind in zip(table.names, table.kinds, strict=True) if kind == "radius"}
@@ -158,12 +163,15 @@ def hold(
 ) -> Held:
     """Estimate poses, stations and boards with the machine fixed.
 
-    start : stations, mounts and poses in frames near those of the machine. data_weights : weights
-    and noise of the data; without it they are estimated, as well as the tubes' radii. magnified :
-    the measurements with an unknown magnification for each camera
-    (:func:`~pkmcal.judge.causes.magnified`), to separate it from a change of the machine. Raises
-    ResultError if the poses are not found.
+    start : stations, mounts and poses in frames near those of the machine.
+    data_weights : weights and noise of the data; without it they are estimated, as well as the
+        tubes' radii.
+    magnified : the measurements with an unknown magnification for each camera
+        (:func:`~pkmcal.judge.causes.magnified`), to separate it from a change of the machine.
+
+    Raises ResultError if the poses are not found.
     """
+    # Problem with the machine fixed, with the given noise if any.
     still = held_machine(machine, radii=data_weights is None)
     shading = SHADING_SIGMA if data_weights is None else data_weights.shading
     if data_weights is not None:
@@ -173,6 +181,7 @@ def hold(
     assembled = assemble(still, measurements, default_gauge(still), shading=shading)
     begin = batch_of(still, assembled, replace(start, theta=still.values))
     if data_weights is None:
+        # Weights and noise are estimated if there are enough rows.
         linear, unknowns = assembled.problem.linearize(begin), assembled.problem.unknowns.count
         unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
         if int(linear.usable.sum()) + len(linear.shared_by) < unknowns:
@@ -232,11 +241,13 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
 class Evidence:
     """Linear regression of new data on a change of the machine, ``w = X c + noise``.
 
-    w : (n,) of unit variance. by : X (n, P + C + 6 k), for the parameters' changes in m and rad,
-    the magnification of C cameras if requested, and the motion (phi, s) of k cameras that were left
-    in place, along their own axes, rad and m. The length of an axis is projected out of X.
-    fixed_stations : (k,) indices of these stations in the session. Every test for a change is a
-    score test on w and X, without an estimate of the machine.
+    w : (n,) of unit variance.
+    by : X (n, P + C + 6 k), for the parameters' changes in m and rad, the magnifications of C
+        cameras if requested, and the motion (phi, s) of k cameras that were left in place, along
+        their own axes, rad and m. Changes of the length of an axis are projected out.
+    fixed_stations : (k,) indices of these stations in the session.
+
+    Every test for a change is a score test on w and X, without an estimate of the machine.
     """
 
     w: Array
@@ -254,8 +265,9 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
     """Evidence on a change from the fixed values, whitened by V = 1 + A C A^T with the
     calibration's covariance C.
 
-    Stations unknown to the calibration are estimated, as nuisance parameters. For the kept ones,
-    residuals refer to the calibration's poses, with the derivatives at the estimated ones.
+    Stations that are not part of the calibration are nuisance parameters and eliminated. For
+    stations that were left in place, residuals refer to the calibration's poses, with the
+    derivatives at the estimated ones.
     """
     machine, n = held.machine, len(held.machine.parameters)
     covariance, stations = prior.covariance, prior.stations
@@ -278,7 +290,7 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
     by[:, :n] = rows[:, :n] @ _across_axes(machine) * size[:n]
     u, s, vt = np.linalg.svd(by, full_matrices=False)
     observable = nonzero(s)
-    # noise is drawn in this basis: signs must not depend on rounding
+    # draws of noise are in this basis, so the signs of its vectors must not depend on rounding
     sign = np.sign(vt[np.arange(len(vt)), np.abs(vt).argmax(axis=1)])[observable]
     by = (sign * s[observable])[:, None] * vt[observable] / size
     projected = -sign * (u[:, observable].T @ residual)

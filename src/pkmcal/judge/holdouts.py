@@ -22,7 +22,7 @@ from pkmcal.mechanisms import Machine
 class HoldOut:
     """Comparison on configurations that were held out, and on those that the calibration used.
 
-    estimate : from the latter.
+    estimate : without the configurations held out.
     """
 
     region: Neighbours

@@ -1,18 +1,18 @@
-"""Difference between two estimates of one machine, and the part of it that chance explains.
+"""Difference between two estimates of one machine, and its covariance due to chance alone.
 
 Frames are conventions, so both are expressed in the frames in which they differ least: by least
 squares over all free parameters, each in its prior sigma. The remaining difference y does not
 depend on frames.
 
-Both estimates use the same nominal model where they have the same one, and the same images as far
-as they share them. With the nominal model's covariance 1 (in prior sigmas), and the information I_a
-and I_b that the data of each add, their covariances are C = (1 + I)^-1, and
+The estimates are correlated if they have the same nominal model, or share images. With the nominal
+model's covariance 1 (in prior sigmas), and the information I_a and I_b of the data of each, their
+covariances are C = (1 + I)^-1, and
 
     cov(y_b - y_a) = C_a + C_b - C_a J C_b - C_b J C_a,    J = 1 + I_shared,
 
-without the 1 where the nominal models differ. Where the data of one determine a direction better,
-the shared part is no more than the lesser: an estimate by the same data, but not as good, differs
-by C_a - C_b (Hausman, 1978).
+without the 1 where the nominal models differ. I_shared is bounded by the smaller information in
+each direction: an estimate from the same data with less information differs by C_a - C_b (Hausman,
+1978).
 """
 
 from __future__ import annotations
@@ -39,11 +39,13 @@ from pkmcal.solver.ranks import numerical_rank
 
 @dataclass(frozen=True)
 class MachineChange:
-    """Machine b less machine a, in a's frames aligned so that they differ least.
+    """Machine b minus machine a, in a's frames aligned so that they differ least.
 
-    machine : a with b's values in these frames. change : (P,) of the parameters, m and rad.
-    covariance : (P, P) of that by chance alone; zeros between nominal models. chi2, dof : of all
-    that the data tell of the change; dof is 0 between nominal models.
+    machine : a with b's values in these frames.
+    change : (P,) of the parameters, m and rad.
+    covariance : (P, P) of the change due to chance alone; zeros between nominal models.
+    chi2, dof : of the change in the directions that the data determine; dof is 0 between nominal
+        models.
     """
 
     machine: Machine
@@ -56,7 +58,7 @@ class MachineChange:
 
     @property
     def sigma(self) -> Array:
-        """(P,) standard deviations of the change by chance."""
+        """Standard deviations (P,) of the change due to chance alone."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
@@ -70,11 +72,12 @@ def machine_change(
 ) -> MachineChange:
     """Difference between two machines with the same parameters.
 
-    covariances : (P, P) of either's parameters in any frames; None for a nominal model, whose
-        values are taken as exact.
+    covariances : (P, P) of either machine's parameters in any frames; None for a nominal model,
+        whose values are exact.
     same_nominal : whether both calibrations have the same nominal model.
     shared : share of the smaller data set that the other calibration has as well.
     """
+    # b's parameters and covariance in frames aligned to a's
     held = replace(a, parameters=replace(a.parameters, nominal=a.values))
     table, layout = held.parameters, held.layout
     none = np.zeros((0, 4, 4))
@@ -85,7 +88,7 @@ def machine_change(
     cov_a, cov_b = covariances
     if cov_b is not None:
         cov_b = carried @ cov_b @ carried.T
-    # in tolerances, the free numbers alone, frames taken out
+    # free parameters in prior sigmas, frames projected out
     tolerance = table.tolerances_free()
     inward = np.linalg.pinv(table.free_matrix()) / tolerance[:, None]
     frames = generators(layout, a.values) @ freedoms(held)
@@ -97,6 +100,7 @@ def machine_change(
     change = there - a.values
     invariant = rest.T @ inward
     y = invariant @ change
+    # covariance of the difference apart from frames, and its chi-square
     spreads = [None if c is None else invariant @ c @ invariant.T for c in (cov_a, cov_b)]
     spread, null_space = _spread(spreads, y.size, same_nominal, shared)
     outward = table.free_matrix() * tolerance @ rest
@@ -113,12 +117,14 @@ def machine_change(
 def _spread(
     spreads: Sequence[Array | None], size: int, same_nominal: bool, shared: float
 ) -> tuple[Array, Array]:
-    """Covariance (r, r) of the difference by chance, and the directions (r, k) that data tell."""
+    """Covariance (r, r) of the difference by chance, and the directions (r, k) that data
+    determine.
+    """
     covariances = [c for c in spreads if c is not None]
     if not covariances:
         return np.zeros((size, size)), np.zeros((size, 0))
     values, vectors = np.linalg.eigh(np.mean(covariances, axis=0))
-    # directions of which data leave nearly all of the nominal model's variance are undetermined
+    # directions that retain nearly all of the nominal model's variance are undetermined
     null_vectors = vectors[:, values < 1 - NEGLIGIBLE]
     if len(covariances) == 1:
         return covariances[0], null_vectors
@@ -128,20 +134,20 @@ def _spread(
     unit = np.eye(len(one))
     joint = shared * (lesser - unit) + (unit if same_nominal else 0.0)
     cross = one @ joint @ other
-    # each estimate converged to a negligible share of its deviation, so that two from the same data
-    # are never compared with a spread of zero
+    # Each estimate has converged to a negligible share of its standard deviation only. That is the
+    # lower bound of the spread of two estimates from the same data.
     spread = one + other - cross - cross.T + NEGLIGIBLE**2 * (one + other)
     return spread, null_vectors
 
 
 def _bounded(covariance: Array) -> Array:
-    """Covariance in tolerances, no larger than the nominal model's, no smaller than rounding."""
+    """Covariance in prior sigmas, bounded above by the nominal model's and below by rounding."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     return (vectors * np.clip(values, ROUNDING, 1.0)) @ vectors.T
 
 
 def _lesser(one: Array, other: Array) -> Array:
-    """The lesser of two informations in each of the directions in which both are diagonal."""
+    """Smaller of two informations, in the basis in which both are diagonal."""
     root = np.linalg.cholesky(other)
     back = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(back @ one @ back.T)

@@ -1,8 +1,8 @@
 """Errors of a machine against a reference machine, such as a simulation's truth.
 
 Frames are conventions: the same machine in other frames has other parameters, and its poses differ
-by the frames alone. So the frames of base and platform are first aligned to the reference by all
-joint centres ([B] eq. 15), and the remaining difference is the error.
+by the frames. So the frames of base and platform are first aligned to the reference by all joint
+centres ([B] eq. 15), and the remaining difference is the error.
 """
 
 from __future__ import annotations

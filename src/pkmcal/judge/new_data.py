@@ -1,5 +1,4 @@
-"""New data of a calibrated machine: configurations that are new, and a first estimate by these
-data.
+"""Measurements of a calibrated machine in a new session, and the configurations that are new.
 
 The calibrated machine, free within its prior sigmas, is the best start for measuring the images; of
 this estimate only the measurements and the poses of platform and stations are used.
@@ -7,6 +6,7 @@ this estimate only the measurements and the poses of platform and stations are u
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import compress
 from typing import Any
@@ -21,6 +21,7 @@ from pkmcal.calibration.localization import check_observable
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras.files import load_camera, written_camera
 from pkmcal.errors import InputError
+from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.progress import Progress, part
 from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose
@@ -55,7 +56,7 @@ def repeated_rows(saved: SavedCalibration, session: Session) -> Booleans:
 
 
 def check_new(valid: Booleans, visible: Booleans, what: str, expected: str, next_step: str) -> None:
-    """Raise `InputError`, in these words, if no observed configuration is new to the
+    """Raise `InputError`, with the given texts, if no observed configuration is new to the
     calibration.
     """
     if not np.any(visible & ~valid):
@@ -66,6 +67,18 @@ def check_new(valid: Booleans, visible: Booleans, what: str, expected: str, next
             expected=expected,
             next_step=next_step,
         )
+
+
+def temperature_notes(saved: SavedCalibration, session: Session) -> Iterator[Finding]:
+    """Notes on the thermal growth of a calibrated machine in a session: applied, or not and why."""
+    growth, temperature = saved.machine.document.growth, session.temperature
+    if growth is not None and temperature is not None:
+        low, high = (float(end) for end in (temperature.min(), temperature.max()))
+        yield note("readings.growth_applied", low=low, high=high, calibrated=growth.temperature)
+    elif growth is not None:
+        yield doubtful("readings.growth_not_applied", calibrated=growth.temperature)
+    elif temperature is not None:
+        yield note("readings.growth_unknown", mean=float(temperature.mean()))
 
 
 def measured_new_data(
@@ -93,9 +106,10 @@ def measured_new_data(
 
 
 def _as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
-    """Stations with the camera response and the half turn of images that the calibration found.
+    """Stations with the camera response and the half turn of images that the calibration
+    determined.
 
-    The session's own response has precedence. A few new images determine both worse.
+    The session's own response has precedence. A few new images determine both less reliably.
     """
     responses = {row["name"]: row.get("response") for row in saved.document["stations"]}
     turned = {
@@ -116,7 +130,7 @@ def _as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, 
         # Turn the images by half where the calibration had to.
         camera = station.camera
         turned_camera = turned.get(station.camera_file)
-        # otherwise the file has been corrected since, or is another one
+        # otherwise the camera file was corrected since the calibration, or replaced
         if turned_camera is not None and np.allclose(
             camera.turned_by_half().parameters, turned_camera.parameters
         ):

@@ -24,9 +24,10 @@ class Straightness:
 class LinePath:
     """Straight path that the session names.
 
-    n : number of points. seen : straightness in the images; None with fewer than three points.
-    nominal model, calibrated : by forward kinematics of the readings; None if a machine does not
-    close.
+    n : number of points.
+    seen : straightness of the poses observed in the images; None with fewer than three points.
+    drawing, calibrated : straightness by forward kinematics of the readings, of the nominal and of
+        the calibrated machine; None if a machine does not close.
     """
 
     name: str

@@ -1,10 +1,10 @@
-"""Prediction of readings and tool points that images observe, by a fixed machine.
+"""Prediction of readings and tool points by a fixed machine, from images.
 
 Stations, mounts and platform poses are estimated from the images with the machine fixed
 (:mod:`pkmcal.judge.fixed_machine`). Where images do not determine the poses of stations and boards
 (a board is observed by a camera of unknown pose), the readings of *other* configurations do:
-closures enter the estimate with the large standard deviation :data:`SOFT_READING_NOISE`, which
-gives way to any observation, and each configuration's own readings are then removed exactly, by
+closures enter the estimate with the large standard deviation :data:`SOFT_READING_NOISE`, so that
+any observation dominates them, and each configuration's own readings are then removed exactly, by
 their leverage (leave-one-out).
 
 With E the rows of readings and ``P = 1 - Q Q^T - q q^T`` the projector of
@@ -66,11 +66,13 @@ class ReadingErrors:
 class Prediction:
     """Prediction of a session by a machine; values are NaN for configurations without observations.
 
-    machine : fixed, with the session's tube radii. observed : (K,) configurations with an observed
-    pose. T_base_platform : (K, 4, 4) observed, without the configuration's own readings. errors :
-    (K,) of the readings predicted from it, and of the tool point. noise : (n, n) covariance by the
-    noise of images and readings of the residuals of the n = K' m observed readings. by_machine :
-    (n, P) their derivatives by the machine's parameters.
+    machine : fixed machine, with the session's tube radii.
+    observed : (K,) configurations with an observed pose.
+    T_base_platform : (K, 4, 4) observed poses, from fits without the configuration's own readings.
+    errors : (K,) errors of the readings predicted from these poses, and of the tool point.
+    noise : (n, n) covariance of the residuals of the n = K' m observed readings, due to the noise
+        of images and readings.
+    by_machine : (n, P) derivatives of these residuals by the machine's parameters.
     """
 
     machine: Machine
@@ -84,13 +86,14 @@ class Prediction:
 def predict(machine: Machine, measurements: Measurements, start: State) -> Prediction:
     """Predict readings and tool points of the measured configurations.
 
-    Configurations whose pose follows from little but their own readings, such as those of an image
-    in which hardly an edge was measured, count as not observed.
+    Configurations whose pose is determined almost only by their own readings, such as those of an
+    image with hardly an edge, count as not observed.
 
-    start : stations, mounts and poses in frames near those of the machine. Raises ResultError if
-    they are not found, or if no configuration's pose is observed.
+    start : stations, mounts and poses in frames near those of the machine.
+
+    Raises ResultError if the poses cannot be estimated, or if no configuration's pose is observed.
     """
-    # links determine the difference of two poses, not the pose at either's readings
+    # links determine only the difference of two poses
     soft = replace(measurements, joint_noise=SOFT_READING_NOISE, links=())
     held = hold(machine, soft, start)
     linear = held.problem.linearize(held.state)
@@ -104,8 +107,8 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     along = along @ along.mT
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
     redundancy = np.eye(m) - along - beside @ beside.mT  # L
-    # below this redundancy hardly anything but the readings determined the pose: the uncertainty
-    # by the observations was ten times SOFT_READING_NOISE
+    # Below this redundancy the readings themselves determine the pose: its standard deviation by
+    # the observations is ten times SOFT_READING_NOISE.
     determined = np.linalg.eigvalsh(redundancy).min(axis=-1) >= NEGLIGIBLE
     if not determined.any():
         raise too_little(machine, measurements)

@@ -1,7 +1,7 @@
 """Measurement accuracy by experiment, [A] 4.2 and Table 1: scatter of repeated images.
 
 The session is calibrated, so that every leg is measured at its predicted position; then each image
-is measured by itself. Differences between images of one configuration from one station are the
+is measured by itself. Differences between images of one configuration from one station give the
 noise of a measurement: of the direction and position of each leg's axis, and of its edges.
 """
 
@@ -111,7 +111,8 @@ class StationScatter:
         """Cause of the scatter: ``camera``, ``platform``, ``legs`` or, where no motion explains it,
         ``noise``.
 
-        Separate motions of the legs imitate a motion of the whole in part, and explain more.
+        Separate motions of the legs can reproduce most of a common motion, and have more
+        parameters; so they must explain clearly more.
         """
         best = "camera" if self.camera >= self.platform else "platform"
         whole = max(self.camera, self.platform)
@@ -368,8 +369,8 @@ def _explained(station_edges: _StationEdges, rows: Array, groups: Groups) -> flo
     """Share of the squared scatter that motions of groups explain: 0 as by chance, 1 all.
 
     The share explained by chance is estimated by permuting the repeats of each edge separately,
-    which preserves the edge's scatter and removes its correlation with the other edges. Two edges
-    of a leg always resemble a motion of it.
+    which preserves the edge's scatter and removes its correlation with the other edges. It is never
+    zero: any shifts of two edges of a leg are partly a motion of the leg.
 
     rows : (N, 2, p) derivative of the edges' rotation by a group's motion.
     """

@@ -1,6 +1,7 @@
-"""Verdicts in words: whether the calibrated machine is better than the nominal one, by how much and
-how surely (validate); whether it is unchanged, has changed and where, or the data are insufficient
-(watch).
+"""Verdicts in words, of ``validate`` and ``watch``.
+
+Whether the calibrated machine is better than the nominal one, by how much and how significantly;
+whether it is unchanged, has changed and where, or the data are insufficient.
 """
 
 from __future__ import annotations
@@ -246,9 +247,10 @@ class Names:
 class ComparedSession:
     """Facts of a session for a verdict, besides the tests.
 
-    configurations : (K,) names. calibrated, observed : (K,) used by the calibration, and observed.
-    noisier : ratio to the calibration's factor on the stated noise of edges. stations_moved :
-    cameras that were assumed to be unmoved.
+    configurations : (K,) names.
+    calibrated, observed : (K,) configurations used by the calibration, and those with observations.
+    noisier : noise of the edges relative to that of the calibration.
+    stations_moved : cameras that were assumed to be unmoved and have moved.
     """
 
     configurations: tuple[str, ...]

@@ -23,7 +23,13 @@ from pkmcal.errors import PkmcalError
 from pkmcal.files import json_value
 from pkmcal.judge.comparison import NominalComparison, compare_with_nominal
 from pkmcal.judge.holdouts import HoldOut, by_regions
-from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data, repeated_rows
+from pkmcal.judge.new_data import (
+    calibrated_rows,
+    check_new,
+    measured_new_data,
+    repeated_rows,
+    temperature_notes,
+)
 from pkmcal.judge.paths import LinePath, line_path, paths_of
 from pkmcal.judge.prediction import predict
 from pkmcal.judge.sentences import validation_verdict
@@ -47,11 +53,14 @@ NOT_INDEPENDENT = (
 class Validation:
     """Results of a validation.
 
-    calibration : as loaded. judged : comparison on configurations that it did not use; None without
-    any, when only regions were held out. remeasured : the new data's measurements, with an estimate
-    of their own. calibrated : (K,) configurations that it used. repeated :
-    (K,) new measurements at poses that it used. regions : holdouts within the session. paths :
-    straight paths.
+    calibration : as loaded.
+    judged : comparison on configurations that the calibration did not use; None if only regions
+        were held out.
+    remeasured : measurements of the new data, with an estimate of their own.
+    calibrated : (K,) configurations that the calibration used.
+    repeated : (K,) new measurements at poses that the calibration used.
+    regions : holdouts within the session.
+    paths : straight paths.
     """
 
     calibration: SavedCalibration
@@ -97,10 +106,13 @@ def validate_calibration(
 ) -> Validation:
     """Errors of a calibration on a session that it did not use, without writing files.
 
-    calibration : its folder, or as loaded. session : a loaded session, or its folder. regions :
-    number of regions of the session's workspace that are held out in addition, one after the other,
-    from a calibration on the rest; the session may then be that of the calibration. seed : of the
-    localization. Raises InputError if the two do not belong together.
+    calibration : its folder, or as loaded.
+    session : a loaded session, or its folder.
+    regions : number of regions of the session's workspace that are held out in addition, one after
+        the other, from a calibration on the rest; the session may then be that of the calibration.
+    seed : of the localization.
+
+    Raises InputError if the two do not belong together.
     """
     from threadpoolctl import threadpool_limits
 
@@ -110,6 +122,7 @@ def validate_calibration(
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
         check_predictable(session)
+        # New configurations, measured and estimated with the machine free.
         lines, calibrated = paths_of(session), calibrated_rows(saved, session)
         if not regions:
             check_new(calibrated, _has_image(session), *NOT_INDEPENDENT)
@@ -123,6 +136,7 @@ def validate_calibration(
         prediction = predict(saved.machine, data, estimate.state)
         if not regions:
             check_new(calibrated, prediction.observed, *NOT_INDEPENDENT)
+        # Calibrated and nominal machine compared on the new configurations.
         judged, failed = None, tuple[Finding, ...]()
         repeated = ~calibrated & repeated_rows(saved, session)
         new = np.flatnonzero(prediction.observed & ~calibrated)
@@ -144,7 +158,10 @@ def validate_calibration(
         return Validation(
             calibration=saved,
             session=session,
-            verdict=replace(verdict, findings=(*verdict.findings, *failed)),
+            verdict=replace(
+                verdict,
+                findings=(*verdict.findings, *failed, *temperature_notes(saved, session)),
+            ),
             judged=judged,
             remeasured=remeasured,
             calibrated=calibrated,

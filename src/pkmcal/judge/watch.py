@@ -27,7 +27,12 @@ from pkmcal.identify.assembly import observed_configurations
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import CHANGE_ALPHA, ChangeTests, StationTest, detect_changes
 from pkmcal.judge.fixed_machine import Held, Trust, change_evidence, hold
-from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data
+from pkmcal.judge.new_data import (
+    calibrated_rows,
+    check_new,
+    measured_new_data,
+    temperature_notes,
+)
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.judge.watch_runs import Run, continued, run_of
 from pkmcal.measurements.rows import RowGroups
@@ -49,12 +54,17 @@ NOTHING_NEW = (
 class Watch:
     """Results of the tests of a calibrated machine.
 
-    calibration : as loaded. judged : the tests. residuals : (K,) root mean squares of each
-    configuration's residuals with the fixed machine, in standard deviations. calibrated : (K,)
-    configurations used by the calibration, which are excluded. observed : (K,) those that are
-    tested. noise_scale, pose_scale : factors on the stated noise. same_place : stations with the
-    poses of the calibration. stations_moved : stations that should have them, and do not. run :
-    this test as an entry of the run chart. earlier : those before it.
+    calibration : as loaded.
+    judged : tests for a change.
+    residuals : (K,) root mean squares of each configuration's residuals with the fixed machine, in
+        standard deviations.
+    calibrated : (K,) configurations used by the calibration, which are excluded.
+    observed : (K,) configurations that are tested.
+    noise_scale, pose_scale : factors on the stated noise.
+    same_place : stations that are assumed to have the poses of the calibration.
+    stations_moved : stations among these that have moved.
+    run : this test as an entry of the run chart.
+    earlier : earlier entries.
     """
 
     calibration: SavedCalibration
@@ -114,11 +124,14 @@ def watch_machine(
 ) -> Watch:
     """Test a calibrated machine on new data, without writing files.
 
-    calibration : its folder, or as loaded. session : a loaded session, or its folder; a few
-    configurations are enough. alpha : false-alarm rate. seed : of the localization. same_place :
-    names of stations whose camera was not touched since the calibration; a station that has
-    evidently moved is localized anew and reported. Raises InputError if the two do not belong
-    together.
+    calibration : its folder, or as loaded.
+    session : a loaded session, or its folder; a few configurations are enough.
+    alpha : false-alarm rate.
+    seed : of the localization.
+    same_place : names of stations whose camera was not touched since the calibration; a station
+        that has evidently moved is localized anew and reported.
+
+    Raises InputError if the two do not belong together.
     """
     from threadpoolctl import threadpool_limits
 
@@ -129,6 +142,7 @@ def watch_machine(
         saved, session = read_same_machine(calibration, session)
         _check_usable(saved)
         session = _with_fixed_poses(saved, session, same_place)
+        # New configurations, measured and estimated with the machine free.
         calibrated = calibrated_rows(saved, session)
         check_new(calibrated, np.ones_like(calibrated), *NOTHING_NEW)
         remeasured = measured_new_data(saved, session, seed, part(progress, 0, 0.9))
@@ -155,6 +169,8 @@ def watch_machine(
             stations_moved,
         )
         verdict = watch_verdict(judged, compared)
+        notes = (*verdict.findings, *temperature_notes(saved, session))
+        verdict = replace(verdict, findings=notes)
         tested = observed & ~calibrated
         return Watch(
             calibration=saved,
@@ -174,8 +190,8 @@ def watch_machine(
 
 
 def _reading_scale(saved: SavedCalibration, session: Session) -> float:
-    """Factor on the stated noise of readings found by the calibration, if the session states the
-    same noise; else 1.
+    """Factor on the stated noise of readings that the calibration estimated; 1 if the session
+    states another noise.
     """
     joints = (saved.document.get("session") or {}).get("joints") or {}
     statistics = saved.document.get("statistics") or {}
@@ -217,8 +233,7 @@ def _with_fixed_poses(
 def tests_with_fixed_stations(
     held: Held, prior: CalibrationPrior, alpha: float
 ) -> tuple[ChangeTests, CalibrationPrior, tuple[StationTest, ...]]:
-    """All tests, the prior with the stations that were kept for them, and the stations that have
-    moved.
+    """All tests, the prior with the stations that remain fixed, and the stations that have moved.
 
     If moved cameras explain the data better than any change of the machine, they are freed and the
     tests repeated; so the false-alarm rate remains alpha.

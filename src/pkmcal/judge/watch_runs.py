@@ -1,7 +1,7 @@
 """Earlier results of ``pkmcal watch`` on the same calibrated machine: the data of a run chart.
 
-A result's ``watch.json`` lists its run after those of the result that was in the same folder
-before, so that a folder which is used again and again holds the machine's history.
+A result's ``watch.json`` lists its run after those of the previous result in the same folder, so
+that a folder that is used repeatedly contains the machine's history.
 """
 
 from __future__ import annotations
@@ -39,8 +39,10 @@ def _iso_time(text: str) -> str:
 class LegRun(Schema):
     """Zero of a leg's reading in a run.
 
-    legs : from 1. unit : m or rad. value, sigma : change of the zero, if nothing else changed.
-    limit : change beyond which its test fails.
+    legs : from 1.
+    unit : m or rad.
+    value, sigma : change of the zero, if nothing else changed.
+    limit : change above which its test fails.
     """
 
     legs: Annotated[tuple[int, ...], Field(min_length=1)]
@@ -53,9 +55,13 @@ class LegRun(Schema):
 class Run(Schema):
     """One test of a calibrated machine.
 
-    time : of the test, local, ISO 8601. session : its name. digest : of its data. calibration :
-    digest of the calibrated machine. configurations : number of those tested. share : largest
-    statistic of all tests, relative to its threshold. zeros : of the legs that have one.
+    time : of the test, local, ISO 8601.
+    session : name of the session.
+    digest : digest of the session's data.
+    calibration : digest of the calibrated machine.
+    configurations : number of tested configurations.
+    share : largest statistic of all tests, relative to its threshold.
+    zeros : zeros of the legs that have one.
     """
 
     time: Annotated[str, AfterValidator(_iso_time)]

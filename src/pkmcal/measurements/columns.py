@@ -1,13 +1,12 @@
 """Columns of the Jacobian: effects that change what was measured linearly.
 
-A column is k numbers x of one effect and the derivatives of what was measured by them. What should
-have been measured is, to first order, ``measured + derivative @ x``. All effects on measurements
-are of this one type:
+A column is k numbers x of one effect, with the derivatives of the measurements by them. The
+measurements without the effect are, to first order, ``measured + derivative @ x``. All effects on
+measurements are of this one type:
 
 - *with a prior*, an unknown of the joint estimate (edge shift of a camera, its intrinsics, size of
   a board, ...), or a random effect of the model discrepancy;
-- *without a prior*, a model violation: the score test says whether the data show it
-  (:mod:`pkmcal.identify.score`).
+- *without a prior*, a model violation, for a score test (:mod:`pkmcal.identify.score`).
 """
 
 from __future__ import annotations
@@ -30,25 +29,28 @@ def value_and_sigma(value: Array, sigma: Array) -> Facts:
 
 @dataclass(frozen=True)
 class Column:
-    """An effect of k numbers on what was measured.
+    """An effect of k numbers on the measurements. Absent derivatives are zero.
 
-    code, subject : of its finding; what is affected, by name. kind : word for it in
-    calibration.json.
-
-    edges : (n, 2, k) turn of the normals of the edges ``edge_rows`` (n,), in their bases. poses :
-    (n, 6, k) left perturbation of T_station_target of the poses ``pose_rows`` (n,). Without rows,
-    all of them in their order. edge_numbers : (n, w) the numbers of the column on which each edge
-    depends, where these are few; edges is then (n, 2, w). The problem's structure is that of the
-    rows and numbers, whatever the values of the derivatives. readings : (K, m, k). motion : (S, K,
-    6, k) left perturbation (omega, tau) of the stations' poses, by configuration. station, since :
-    the camera or tracker of that number stands elsewhere from that configuration on, by (omega,
-    tau), k = 6. Absent: no effect on these.
-
-    remark : without a prior, its finding is no reason against the result, whatever it moves.
-    prior : (k, l) root L of the numbers' covariance L L^T; None where nothing is known of them.
-    at : (k,) numbers at which the measurements were made, zero if absent: an estimate finds their
-    change from there. facts : of its finding, from the estimates and their standard deviations
-    (k,).
+    code, subject : code of its finding, and name of what it affects.
+    kind : word for it in calibration.json.
+    edges : (n, 2, k) rotation of the normals of the edges ``edge_rows`` (n,), in their bases;
+        without ``edge_rows`` of all edges in their order.
+    edge_numbers : (n, w) numbers of the column on which each edge depends, where these are few;
+        edges is then (n, 2, w). The structure of the problem follows from rows and numbers only,
+        not from the values of the derivatives.
+    poses : (n, 6, k) left perturbation of T_station_target of the poses ``pose_rows`` (n,), all by
+        default.
+    readings : (K, m, k) change of the readings.
+    motion : (S, K, 6, k) left perturbation (omega, tau) of the stations' poses, by configuration.
+    station, since : number of a camera or tracker that was moved, by (omega, tau) with k = 6, and
+        the first configuration after that.
+    remark : for a column without a prior, its finding is only a remark and no reason against the
+        result, whatever its effect.
+    prior : (k, l) root L of the numbers' prior covariance L L^T; None without a prior.
+    at : (k,) values of the numbers with which the measurements were made, zero by default; an
+        estimate is a change from these.
+    facts : function from the estimates and their standard deviations, (k,) each, to facts of the
+        finding.
     """
 
     code: str
@@ -72,7 +74,7 @@ class Column:
 
     @property
     def count(self) -> int:
-        """Number of its numbers, k."""
+        """Number k of the column's numbers."""
         if self.station is not None:
             return 6
         if self.prior is not None:
@@ -81,7 +83,7 @@ class Column:
         return max((part.shape[-1] for part in parts if part is not None), default=0)
 
     def edges_of(self, number: int) -> Array | None:
-        """Derivatives (N, 2, k) of all N edges; None where it acts on none."""
+        """Derivatives (N, 2, k) of all N edges; None where the effect changes none."""
         edges = self.edges
         if edges is not None and self.edge_numbers is not None:
             few, edges = edges, np.zeros((len(edges), 2, self.count))
@@ -89,7 +91,7 @@ class Column:
         return _everywhere(edges, self.edge_rows, number)
 
     def poses_of(self, number: int) -> Array | None:
-        """Derivatives (N, 6, k) of all N poses; None where it acts on none."""
+        """Derivatives (N, 6, k) of all N poses; None where the effect changes none."""
         return _everywhere(self.poses, self.pose_rows, number)
 
 

@@ -58,13 +58,13 @@ class MeasurementKind(ABC):
 
     code : identifier in files and programs.
     one : name of one measurement in reports and messages.
-    label : its plural.
+    label : plural of the name.
     unit : unit of the numbers.
     numbers : largest number of residuals of one measurement.
     joins : number of configurations on which one measurement depends.
     default_sigma : standard deviation where a session states none, in ``unit``; None where it has
         to be stated.
-    own_sigma : where a user finds that of his own instrument, in words.
+    own_sigma : source of the standard deviation of a user's own instrument, in words.
     """
 
     code: ClassVar[str]
@@ -80,7 +80,7 @@ class MeasurementKind(ABC):
 class ImageKind(MeasurementKind):
     """Kind that is measured in images.
 
-    observe : its word under ``stations.*.observe``.
+    observe : its keyword under ``stations.*.observe``.
     """
 
     observe: ClassVar[str]
@@ -123,8 +123,8 @@ class TargetKind(MeasurementKind, ABC):
 
     @classmethod
     def T_tracker_target(cls, table: CsvTable) -> Array:
-        """Measurements (N, 4, 4) of a table with one of the headers; what is not measured is that
-        of the identity.
+        """Measurements (N, 4, 4) of a table with one of the headers; components that are not
+        measured are those of the identity.
 
         Raises `InputError` for a row that is no pose.
         """
@@ -162,8 +162,8 @@ class LinkKind(MeasurementKind, ABC):
     """Numbers that link two configurations, under a key of their own in session.yaml.
 
     Each measurement is one number with its own standard deviation, of a point on the platform that
-    is estimated with the machine. Where the residuals show larger deviations than stated, all kinds
-    of links share one noise scale.
+    is estimated with the machine. All kinds of links share one noise scale, which is estimated if
+    the residuals are larger than stated.
 
     key, schema : of session.yaml.
     """
@@ -196,8 +196,8 @@ class LinkKind(MeasurementKind, ABC):
     @classmethod
     @abstractmethod
     def check_start(cls, links: LinkSet, T_base_platform: Array) -> None:
-        """Raise `InputError` for faults that the nominal model's poses (K, 4, 4) reveal, such as
-        another unit.
+        """Raise `InputError` for faults, such as another unit, that appear with the nominal model's
+        poses (K, 4, 4).
         """
 
 

@@ -45,7 +45,7 @@ unit: inches for millimetres make 25.4, and no nominal model is wrong by a facto
 
 
 class DistancesDocument(Schema):
-    """``distances``: where the table is, and how good its distances are."""
+    """``distances``: file of the table, and noise of the distances."""
 
     file: str = Field(description="the table of distances, for example distances.csv")
     noise: Annotated[Metres, NOISE_FIELD_RANGE] | None = Field(

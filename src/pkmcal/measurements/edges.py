@@ -31,8 +31,8 @@ station, under even light. Hard light and polished metal cause ten times as much
 enlarge it. 0.02 in path-traced images of matt machines, 0.05 in those of our own renderer."""
 
 OWN_SHADING = 0.015
-"""Standard deviation (px) of the shift by shading of one edge beside the common shift of its line,
-under even light; highlights and mirror images in metal cause ten times as much."""
+"""Standard deviation (px) of the shift by shading of one edge in addition to the common shift of
+its line, under even light; highlights and mirror images in metal cause ten times as much."""
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -53,24 +53,24 @@ class Edges(ImageKind):
 class EdgeSet:
     """Silhouette edges of legs in images; N edges, flat arrays, all indices from 0.
 
-    station, configuration, leg, tube, side : (N,) where the edge was measured; side as in
+    station, configuration, leg, tube, side : (N,) indices of each edge; side as in
         :mod:`pkmcal.geometry.cylinders` (0 or 1).
-    normal : (N, 3) unit normal of the plane of edge and camera centre, camera frame,
-        pointing away from the leg's axis.
+    normal : (N, 3) unit normal of the plane of edge and camera centre, camera frame, pointing away
+        from the leg's axis.
     basis : (N, 3, 2) orthonormal tangent basis at the normal: shift first, tilt second.
     covariance : (N, 2, 2) of the normal in that basis, rad^2.
-    shift : (N, 2) change of the normal, in that basis, when every point of the edge moves
-        outward by one pixel (rad/px).
+    shift : (N, 2) change of the normal, in that basis, when every point of the edge moves outward
+        by one pixel (rad/px).
     span : (N, 2) first and last visible position along the leg, m from A.
     by_intrinsics : (N, 2, n) change of the normal, in that basis, by the camera's parameters with
         the edge's pixels fixed; n = 0 where it is not needed.
-    by_focal : (N, 2) the same by the relative excess of the focal lengths, where these differ from
-        image to image; else zero.
-    shading : (N,) px, standard deviation of each edge's shift by shading beside the common shift of
-        its line; correlated between edges of a line with near normals
-        (:mod:`~pkmcal.measurements.line_cells`). It counts where measurements are ``shaded``.
+    by_focal : (N, 2) change of the normal by the relative excess of the focal lengths, where these
+        differ between images; otherwise zero.
+    shading : (N,) px, standard deviation of each edge's shift by shading in addition to the common
+        shift of its line; correlated between edges of a line with similar normals
+        (:mod:`~pkmcal.measurements.line_cells`). Used where measurements are ``shaded``.
     coarse : (N,) whether the edge follows from the fit of a whole machine's silhouettes to image
-        edges (:mod:`pkmcal.observe.silhouettes`) and was not measured by itself.
+        edges (:mod:`pkmcal.observe.silhouettes`) instead of a measurement of its own.
     """
 
     station: Integers
@@ -117,8 +117,10 @@ class EdgeSet:
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def same_as(self, other: EdgeSet) -> tuple[Integers, Integers]:
-        """Positions, in this set and in another, of the edges in both: of the same station,
-        configuration, leg, tube and side. Each edge is in a set once.
+        """Positions, in this set and in another, of the edges in both sets.
+
+        Equal edges have the same station, configuration, leg, tube and side, and occur once in a
+        set.
         """
         each = [
             np.stack([of.station, of.configuration, of.leg, of.tube, of.side], axis=1)
@@ -147,7 +149,7 @@ class EdgeSet:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A measurement that was rejected, or not found, and the reason.
+    """A measurement that was rejected or not detected, with the reason.
 
     tube and side are -1 for a whole leg, leg is -1 for a whole image. code : of the finding whose
     sentence the reason is, empty for other reasons.
@@ -164,20 +166,25 @@ class Rejection:
 
 @dataclass(frozen=True)
 class EdgeBlocks:
-    """Positions of the edges: K configurations of G blocks, padded; the same for all runs. Each leg
-    has the same number of consecutive positions in all configurations.
+    """Positions of the edges: K configurations of G blocks, padded; the same for all runs.
 
-    Edges that share their noise are whitened together: a *block* is g edges (g = 1 for edges
-    measured in images, g = 2 for the two edges that stand for a measured axis, [A] Table 1)
-    of one tube at one station, with one 2g x 2g whitening matrix and one robust weight.
+    Edges that share their noise are whitened together: a *block* is g edges of one tube at one
+    station (g = 1 for edges measured in images, g = 2 for the two edges that stand for a measured
+    axis, [A] Table 1), with one 2g x 2g whitening matrix and one robust weight. Each leg has the
+    same number of consecutive positions in all configurations.
 
-    leg : (1, G). station, radius : (K, G) station, position of the tube's radius. side : (K, G, g).
-    present : (K, G) False for padding. column : (K, G, w) which of the estimate's columns move each
-    edge, -1 for none. alone : (K, G) px, standard deviation of the shading of edges that are a line
-    of their own, zero for all others. tube : (K, G) number of the tube on its leg. n_effective :
-    (K, G) how many of its line share an edge's own shading, see
-    :mod:`~pkmcal.measurements.line_cells`, zero where nothing is shaded. cell : (K, G) which of the
-    ``cells`` each is in, -1 for none.
+    leg : (1, G).
+    station, radius : (K, G) station, and position of the tube's radius among the parameters.
+    side : (K, G, g).
+    present : (K, G) False for padding.
+    column : (K, G, w) numbers of the unknown effects that change each edge, -1 for none.
+    alone : (K, G) px, standard deviation of the shading of edges that are a line of their own, zero
+        for all others.
+    tube : (K, G) number of the tube on its leg.
+    n_effective : (K, G) number of edges of its line that share an edge's own shading
+        (:mod:`~pkmcal.measurements.line_cells`), zero without shading.
+    cell : (K, G) number of each edge's cell among ``cells``, -1 for none.
+    cells : cells of edges with similar normals.
     """
 
     leg: Integers
@@ -198,7 +205,7 @@ class EdgeBlocks:
 
     @cached_property
     def views(self) -> EdgeViews:
-        """The blocks by views, without padding."""
+        """Blocks sorted by view, without padding."""
         configuration, number = np.nonzero(self.present)
         leg, station = self.leg[0, number], self.station[configuration, number]
         order = np.lexsort((number, configuration, station, leg))
@@ -217,7 +224,7 @@ class EdgeBlocks:
 
     @cached_property
     def view_columns(self) -> ViewColumns:
-        """The columns that move the edges of each view."""
+        """Effects that change the edges of each view."""
         views = self.views
         group = np.repeat(np.arange(len(views.groups)), [c.stop - c.start for c in views.groups])
         column = views.taken(self.column)
@@ -233,16 +240,18 @@ class EdgeBlocks:
 
     @cached_property
     def number(self) -> Integers:
-        """(K, G) number of each block among those of the views, (N m); any for padding."""
+        """Number (K, G) of each block among those of the views, (N m); arbitrary for padding."""
         views, out = self.views, np.zeros(self.present.size, dtype=int)
         out[views.place[views.present]] = np.flatnonzero(views.present)
         return out.reshape(self.present.shape)
 
 
 class ViewColumns(NamedTuple):
-    """Columns that move the edges of views: of_groups (groups, W) of each group, in increasing
-    order, -1 where there are fewer; of_views (N, W) the same by view; slots (N, m, w) which of
-    these each block's own columns are, -1 for none.
+    """Numbers of the effects that change the edges of views.
+
+    of_groups : (groups, W) of each group of views, in increasing order, -1 for padding.
+    of_views : (N, W) the same by view.
+    slots : (N, m, w) position of each block's numbers among those of its view, -1 for none.
     """
 
     of_groups: Integers
@@ -252,11 +261,13 @@ class ViewColumns(NamedTuple):
 
 @dataclass(frozen=True)
 class EdgeViews:
-    """N views, each of one leg in one image: up to m blocks, whose edges are those of one axis.
+    """N views, each of one leg in one image: up to m blocks, with edges of one axis.
+
     Views of one leg from one station are contiguous.
 
-    configuration, leg, station : (N,). place : (N, m) position of each block among those of all
-    configurations, (K G). present : (N, m) False for padding, which has another block's position.
+    configuration, leg, station : (N,).
+    place : (N, m) position of each block among those of all configurations, (K G).
+    present : (N, m) False for padding, which has another block's position.
     """
 
     configuration: Integers
@@ -266,7 +277,7 @@ class EdgeViews:
     present: Booleans
 
     def taken(self, numbers: NDArray[Scalar], axis: int = 0) -> NDArray[Scalar]:
-        """Numbers of the blocks (..., K, G, ...) by view, (..., N, m, ...); axis : that of K."""
+        """Gather numbers of blocks (..., K, G, ...) by view, (..., N, m, ...); axis : that of K."""
         shape = numbers.shape
         flat = numbers.reshape(*shape[:axis], shape[axis] * shape[axis + 1], *shape[axis + 2 :])
         return flat.take(self.place, axis=axis)
@@ -287,14 +298,18 @@ class EdgeViews:
 class EdgeData:
     """Measured values of each run; leading axis B, or 1 where all runs share them.
 
-    basis : (B, K, G, g, 3, 2). white : (B, K, G, 2g, 2g) whitening of each block's noise as it was
-    stated, shading left out. shift : (B, K, G, 2g) change of the measured normals by a pixel
-    outward. joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale
-    squared. columns : (B, K, G, 2g, w) derivatives of the rows, before they are whitened, by the
-    blocks' ``column``. unit : (B or 1, n) by what the n columns of the estimate are multiplied:
-    standard deviations, px, of the lines' shading, one of all others. scale : (B, K, G) factor on
-    the stated noise. own : (B, K, G) px, standard deviation of the shading of each edge beside its
-    line's, that of all who share it counted.
+    basis : (B, K, G, g, 3, 2).
+    white : (B, K, G, 2g, 2g) whitening of each block's stated noise, without shading.
+    shift : (B, K, G, 2g) change of the measured normals by a pixel outward.
+    joints : (B, K, m).
+    weight : (B, K, G) robust weight of each block, 0..1, divided by the squared noise scale.
+    columns : (B, K, G, 2g, w) derivatives of the rows, before whitening, by the effects in
+        ``EdgeBlocks.column``.
+    unit : (B or 1, n) units of the n numbers of all effects: px, standard deviations, for the
+        lines' shading, 1 for all others.
+    scale : (B, K, G) factor on the stated noise.
+    own : (B, K, G) px, standard deviation of each edge's own shading, multiplied by the root of the
+        number of edges that share it.
     """
 
     basis: Array
@@ -313,14 +328,15 @@ class EdgeData:
 
     @cached_property
     def by_shift(self) -> Array:
-        """Rows by a pixel of shift, in the noise as it was stated, (B or 1, K, G, 2g)."""
+        """Derivative (B or 1, K, G, 2g) of the rows, in stated noise, by a shift of one pixel."""
         return (self.white @ self.shift[..., None])[..., 0]
 
     @cached_property
     def whiten(self) -> Array:
-        """Whitening (B or 1, K, G, 2g, 2g) of the noise with its scale and the edges' own shading:
-        in units of the stated noise the covariance is ``scale^2 + own^2 v v^T`` with v the
-        :attr:`by_shift`; its inverse root differs from the identity along v only.
+        """Whitening (B or 1, K, G, 2g, 2g) of the noise with its scale and the edges' own shading.
+
+        In units of the stated noise the covariance is ``scale^2 + own^2 v v^T`` with v the
+        :attr:`by_shift`; its inverse root differs from ``1 / scale`` along v only.
         """
         if not self.own.any():
             return self.white / self.scale[..., None, None]
@@ -338,13 +354,15 @@ class EdgeData:
 
 @dataclass(frozen=True)
 class ViewData:
-    """The edges' derivatives by view, whitened and weighted: n rows of each view (B or 1, N), 2g
-    for each of its m blocks. The rows are the last axis, so that NumPy's inner loops run over all
-    views: a nanosecond a number and operation.
+    """Derivatives of the edges by view, whitened and weighted.
 
-    of_normals : (g, ..., 3, n) rows by changes of the normals, camera frame. by_columns : (W, ...,
-    n) by the columns of their group (:class:`ViewColumns`). counts : (..., n) whether the
-    block is there and has a weight. sign : (g, N, n) of the edges' sides.
+    Each view (B or 1, N) has n rows, 2g for each of its m blocks. Rows are the last axis, so that
+    NumPy's inner loops run over all views.
+
+    of_normals : (g, ..., 3, n) by changes of the normals, camera frame.
+    by_columns : (W, ..., n) by the effects of their group (:class:`ViewColumns`).
+    counts : (..., n) whether the block is present and has a weight.
+    sign : (g, N, n) sign of the edges' sides.
     """
 
     of_normals: Array
@@ -354,7 +372,7 @@ class ViewData:
 
     @classmethod
     def of(cls, blocks: EdgeBlocks, data: EdgeData) -> ViewData:
-        """The data of all edges that are present."""
+        """Derivatives of all edges that are present."""
         views = blocks.views
         counts = (views.taken(data.weight, 1) > 0) & views.present
         white = np.where(counts[..., None, None], views.taken(data.weighed, 1), 0.0)
@@ -388,13 +406,17 @@ class ViewData:
 
 @dataclass(frozen=True)
 class EdgeRows:
-    """The edges' rows at a state, with their derivatives by the two ends of their axis; all other
-    derivatives follow by the chain rule. Last axes are the views (B, N), or their rows (B, N, n).
+    """Rows of the edges at a state, with their derivatives by the two ends of their axis.
 
-    T_camera_base : (B, S, 4, 4). lines : camera frame. frame : (B, N, 3, 3) their u, m and w.
-    sine (...) and cosine (g, ...) : of :func:`~pkmcal.geometry.cylinders.edge_planes`, NaN where a
-    leg passes through the camera. by_frame : (g, 3, ...) rows by changes of the normals along u, m
-    and w.
+    All other derivatives follow by the chain rule. The last axes are the views (B, N), or their
+    rows (B, N, n).
+
+    T_camera_base : (B, S, 4, 4).
+    lines : axes in the camera frame.
+    frame : (B, N, 3, 3) u, m and w of the lines.
+    sine, cosine : (...) and (g, ...), of :func:`~pkmcal.geometry.cylinders.edge_planes`, NaN where
+        a leg passes through the camera.
+    by_frame : (g, 3, ...) derivatives of the rows by changes of the normals along u, m and w.
     """
 
     blocks: EdgeBlocks
@@ -408,13 +430,15 @@ class EdgeRows:
     by_frame: Array
 
     def value(self, columns: Array) -> Array:
-        """Rows (B, N, n), zero where they do not count, at numbers (B, n) of the columns."""
+        """Rows (B, N, n) at the numbers ``columns`` (B, n) of the effects; zero for padding and
+        rejected edges.
+        """
         data, (_, of_views, _) = self.data, self.blocks.view_columns
         (_, along_m, along_w), *others = self.by_frame
         rows = self.cosine[0] * along_m - self.sine * along_w
         for cosine, (_, along_m, along_w) in zip(self.cosine[1:], others, strict=True):
             rows += cosine * along_m - self.sine * along_w
-        numbers = with_zero(columns)  # the last is none's
+        numbers = with_zero(columns)  # the last one is for padding
         for by, column in zip(data.by_columns, of_views.T, strict=True):
             rows += by * numbers[:, column, None]
         return np.where(data.counts, rows, 0.0)
@@ -426,16 +450,19 @@ class EdgeRows:
 
     @cached_property
     def _turns(self) -> Array:
-        """Derivative of the rows by a shift of the whole axis towards the camera, (g, ...): equal
-        to that by the radius; see :meth:`~pkmcal.geometry.cylinders.LineSilhouettes.edges`.
+        """Derivative (g, ...) of the rows by a shift of the whole axis towards the camera.
+
+        Equal to the derivative by the radius; see
+        :meth:`~pkmcal.geometry.cylinders.LineSilhouettes.edges`.
         """
         along_m, along_w = self.by_frame[:, 1], self.by_frame[:, 2]
         turn = along_w + (self.sine / self.cosine) * along_m
         return turn / self._of_views(self.lines.distance)
 
     def by_ends(self) -> Array:
-        """Derivatives by both ends along m and along w, a before b, (4, B, N, n). Motions along u
-        do not change an edge; all other derivatives are multiples of these.
+        """Derivatives (4, B, N, n) by both ends along m and along w, a before b.
+
+        Motions along u do not change an edge; all other derivatives are multiples of these.
         """
         line, out = self.lines, np.empty((4, *self.sine.shape))
         shift = self.by_frame[:, 0] / self._of_views(line.length)
@@ -450,13 +477,14 @@ class EdgeRows:
         return out
 
     def by_radius(self) -> Array:
-        """Derivatives by the radius of their tube, (B, N, n)."""
+        """Derivatives (B, N, n) by the tube's radius."""
         return -np.sum(self._turns, axis=0)
 
     def ends_by(self, freedoms: slice) -> Array:
-        """Derivatives of both ends, a before b, along m and along w, (B, N, 4, d + n_b + n_a + 6):
-        by the configuration's own unknowns, by the parameters of b and of a, and by their station,
-        whose (omega, tau) moves them by ``omega x (p - t) + tau``, with t the base's origin in the
+        """Derivatives (B, N, 4, d + n_b + n_a + 6) of both ends, a before b, along m and along w.
+
+        By the configuration's own unknowns, the parameters of b and of a, and the station, whose
+        (omega, tau) moves the ends by ``omega x (p - t) + tau``, with t the base's origin in the
         camera frame.
         """
         c, views, line = self.closure, self.blocks.views, self.lines
@@ -485,8 +513,10 @@ class EdgeRows:
 
 
 def _side_by_side(parts: tuple[Array, ...], limbs: tuple[int, ...]) -> Array:
-    """Derivatives (B, K, L, 3, n) of the limbs' ends, the limbs one after the other, (B, K L, 3,
-    n); leading axes broadcast. limbs : (B, K, L).
+    """Derivatives (B, K, L, 3, n) of the limbs' ends, concatenated over groups of limbs, (B, K L,
+    3, n).
+
+    Leading axes broadcast. limbs : (B, K, L).
     """
     out = np.empty((*limbs, 3, sum(part.shape[-1] for part in parts)))
     first = 0

@@ -1,8 +1,8 @@
-"""Effects on measurements that every estimate counts: each function gives the columns of one.
+"""Effects on measurements that every estimate contains, one function for the columns of each.
 
-An effect is a function of the measurements; to add one, append it to :data:`EFFECTS`, or to
-``Measurements.effects`` for some measurements only. Its columns with a prior become unknowns of the
-joint estimate, those without one are score-tested.
+An effect is a function of the measurements. To add one, append it to :data:`EFFECTS`, or to
+``Measurements.effects`` for some measurements only. Columns with a prior become unknowns of the
+joint estimate, columns without one are score-tested.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ FOCAL_EXCESS, BOARD_SIZE = "station.focal", "board.size"
 SHIFT_SIGMA = 0.3
 """Standard deviation (px) of a camera's constant edge shift before any data: errata, B."""
 FOCAL_SIGMA = 1.5e-3
-"""Standard deviation of a hand-held image's focal length, relative to the camera's. A lens of
-focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5
-mm) changes by 0.3 % from 3 m to 1 m, as one walks about a machine, so half of that to each side."""
+"""Standard deviation of a hand-held image's focal length, relative to the camera's. A lens of focal
+length f that is focused at a distance u forms its image at f u / (u - f): for a telephone (5 mm)
+this changes by 0.3 % between 3 m and 1 m, usual distances to a machine; half of that to each
+side."""
 
 
 def edge_shifts(measurements: Measurements) -> Iterator[Column]:
@@ -62,9 +63,10 @@ def intrinsics(measurements: Measurements) -> Iterator[Column]:
 
 
 def shading(measurements: Measurements) -> Iterator[Column]:
-    """Outward shift of each line (:func:`lines`), in units of its standard deviation, which is
-    estimated: derivatives are by px, and ``EdgeData.unit`` is the standard deviation. Lines of one
-    side of a leg at a station are correlated by TUBE_CORRELATION.
+    """Outward shift of each line (:func:`lines`), in units of its estimated standard deviation.
+
+    Derivatives are by px; ``EdgeData.unit`` contains the standard deviations. Lines of one side of
+    a leg at a station have the correlation TUBE_CORRELATION.
     """
     keys, number = lines(measurements)
     if not len(keys):
@@ -116,8 +118,9 @@ def board_sizes(measurements: Measurements) -> Iterator[Column]:
 
 
 def by_board_size(poses: PoseSet, mount: int) -> tuple[Integers, Array]:
-    """Poses (n,) of a board, and their derivatives (n, 6, 1) by the relative excess of its size: a
-    board that is larger by a share stands farther from the camera by the same share.
+    """Poses (n,) of a board, and their derivatives (n, 6, 1) by the relative excess of its size.
+
+    At given corners in the image, a larger board is farther from the camera by the same ratio.
     """
     own = np.flatnonzero(poses.mount == mount)
     by = np.zeros((len(own), 6, 1))
@@ -136,15 +139,17 @@ def columns_of_effects(measurements: Measurements) -> Iterator[Column]:
 
 
 def lines(measurements: Measurements) -> tuple[Integers, Integers]:
-    """Each line's station, leg, tube and side (n, 4), and the number (N,) of each edge's line; none
-    if nothing is shaded, and -1 at stations of one image, where each edge is a line of its
+    """Lines of the shading: station, leg, tube and side (n, 4) of each, and the number (N,) of each
+    edge's line.
+
+    No lines if nothing is shaded. -1 at stations of one image, where each edge is a line of its
     own.
     """
     e = measurements.edges
     if not measurements.shaded or not len(e):
         return np.zeros((0, 4), dtype=int), np.zeros(0, dtype=int)
     number = np.full(len(e), -1)
-    # stations that saw one configuration alone, as images by hand do
+    # stations with a single configuration, such as hand-held images
     pair = np.unique(np.stack([e.station, e.configuration], axis=1), axis=0)
     many = np.bincount(pair[:, 0], minlength=measurements.n_stations)[e.station] != 1
     keys = np.stack([e.station, e.leg, e.tube, e.side], axis=1)[many]

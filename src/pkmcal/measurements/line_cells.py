@@ -13,18 +13,18 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, short_repr
 
 SHADING_CORRELATION_ANGLE = np.radians(7.0)
-"""Correlation angle of shading, rad: errors of edges of one side of a tube at one station are
-correlated by exp(-angle / SHADING_CORRELATION_ANGLE), angle that between their normals, since a
-mirrored image or a highlight moves with the normal. Edges of path-traced tubes, metal and painted,
-correlate by one half at 5 degrees once the mean of all is removed."""
+"""Correlation angle of shading, rad: errors of edges of one side of a tube at one station have the
+correlation exp(-angle / SHADING_CORRELATION_ANGLE) with the angle between their normals, since a
+mirrored image or a highlight moves with the normal. On path-traced tubes, metal and painted, the
+correlation is one half at 5 degrees once the mean of all edges is removed."""
 
 TUBE_CORRELATION = 0.4
 """Factor on that correlation between edges of two tubes of a leg on one side, which are lit by and
 mirror the same surroundings in part: 0.2 to 0.6 on path-traced legs of five finishes."""
 CELLS_AN_ANGLE, CELLS_AN_ANGLE_OF_MANY, MANY_EDGES = 64, 8, 10_000
-"""Cells along SHADING_CORRELATION_ANGLE, and the same for many edges, from the third number on,
-where hardly any edge would have a cell of its own. Edges of one cell are correlated to within 0.01,
-and 0.1."""
+"""Number of cells per SHADING_CORRELATION_ANGLE, the same for many edges, and the number of edges
+from which the second value applies. The correlation between edges of one cell is 1 to within 0.01,
+or 0.1."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class LineCells:
         """Number of edges (N,) that share an edge's own shading: the sum of its correlations with
         all edges of its line, itself included.
 
-        Of n edges with the same normal each counts 1/n, so that together they count as one whatever
-        their number; an edge that is a line of its own has 1.
+        Each of n edges with the same normal counts 1/n, so that their total weight is that of one
+        edge; the value is 1 for an edge that is a line of its own.
         """
         many = np.ones(len(self.count) + 1)
         for own, _, similar in self.correlated_groups():

@@ -40,7 +40,7 @@ class LinkSet(ABC):
     mount : (N,) number of the mount on the platform.
     value, sigma : (N,) measured value and its standard deviation, SI.
     lines : (N,) lines of the table, from 1.
-    by_default : whether `sigma` is the kind's default, for the session states none.
+    by_default : whether `sigma` is the kind's default because the session states none.
     """
 
     label: str

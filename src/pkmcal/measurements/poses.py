@@ -22,16 +22,17 @@ from pkmcal.measurements.rows import among
 class PoseSet:
     """N measured poses.
 
-    station : (N,) index into the session's stations. configuration : (N,) row of the readings.
-    mount : (N,) what the target is fixed to.
+    station : (N,) index into the session's stations.
+    configuration : (N,) row of the readings.
+    mount : (N,) number of the target's mount.
     T_station_target : (N, 4, 4) target to station (camera or tracker) coordinates, m.
-    whiten : (N, 6, 6) for the left perturbation (omega, tau) of T_station_target, rad and m:
-        whiten @ error has unit covariance. Rows of numbers that are not measured (the rotation of a
-        point) are zero.
-    by_intrinsics : (N, 6, n) that perturbation by the camera's parameters, with the corners'
-        pixels fixed; n = 0 where it is not needed.
-    by_focal : (N, 6) the same by the relative excess of the focal lengths, where these differ from
-        image to image; else zero.
+    whiten : (N, 6, 6) for the left perturbation (omega, tau) of T_station_target, rad and m: whiten
+        @ error has unit covariance. Rows of numbers that are not measured (the rotation of a point)
+        are zero.
+    by_intrinsics : (N, 6, n) derivative of that perturbation by the camera's parameters, with the
+        corners' pixels fixed; n = 0 where it is not needed.
+    by_focal : (N, 6) derivative by the relative excess of the focal lengths, where these differ
+        between images; otherwise zero.
     """
 
     station: Integers
@@ -62,7 +63,7 @@ class PoseSet:
 
     @property
     def rows(self) -> Integers:
-        """(N,) how many of the six numbers each measurement has."""
+        """Number (N,) of measured components of each pose, of six."""
         return np.any(self.whiten != 0, axis=-1).sum(axis=-1)
 
     def select(self, mask: Booleans | Integers) -> PoseSet:
@@ -70,9 +71,10 @@ class PoseSet:
         return PoseSet(*(getattr(self, f.name)[mask] for f in fields(self)))
 
     def transform(self, change: Array) -> PoseSet:
-        """The poses by cameras with other parameters; change : (S, n), by station.
+        """Poses as measured by cameras with other parameters; change : (S, n) of each station's
+        camera.
 
-        To first order: a camera's calibration is good to a thousandth, so the remainder is a
+        To first order: a camera's calibration is accurate to a thousandth, so the remainder is a
         millionth.
         """
         n = self.by_intrinsics.shape[-1]
@@ -84,8 +86,10 @@ class PoseSet:
 class PoseBlocks:
     """Positions of the poses: K configurations of G poses, padded; the same for all runs.
 
-    station, mount : (K, G). present : (K, G) False for padding. on_platform : (M,) of the mounts.
-    column : (K, G, w) which of the estimate's columns move each pose, -1 for none.
+    station, mount : (K, G).
+    present : (K, G) False for padding.
+    on_platform : (M,) whether each mount is on the platform.
+    column : (K, G, w) numbers of the unknown effects that change each pose, -1 for none.
     """
 
     station: Integers
@@ -103,8 +107,11 @@ class PoseBlocks:
 class PoseData:
     """Measured values of each run; leading axis B, or 1 where all runs share them.
 
-    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). columns :
-    (B, K, G, 6, w) derivatives of the error, before it is whitened, by the poses' ``column``.
+    T_station_target : (B, K, G, 4, 4).
+    whiten : (B, K, G, 6, 6).
+    weight : (B, K, G).
+    columns : (B, K, G, 6, w) derivatives of the error, before whitening, by the effects in
+        ``PoseBlocks.column``.
     """
 
     T_station_target: Array
@@ -139,8 +146,10 @@ def pose_rows(
 ) -> PoseRows:
     """Whitened errors of the predicted poses.
 
-    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), columns
-    (B, n).
+    T_camera_base : (B, S, 4, 4).
+    poses : T_base_platform (B, K, 4, 4).
+    T_mount : (B, M, 4, 4).
+    columns : (B, n) numbers of the effects.
     """
     if not blocks.present.size:
         none = np.zeros((*poses.shape[:2], 0, 6, 6))
@@ -149,6 +158,7 @@ def pose_rows(
     camera = T_camera_base[:, blocks.station]
     body = np.where(moving, poses[:, :, None], np.eye(4))
     mount = T_mount[:, blocks.mount]
+    # error of the predicted pose, and the inverse left Jacobian of its rotation vector
     rot_c, rot_b = camera[..., :3, :3], body[..., :3, :3]
     arm = rot_b @ mount[..., :3, 3:]
     place = rot_c @ (arm + body[..., :3, 3:])
@@ -164,8 +174,9 @@ def pose_rows(
         out[..., 3:, 3:] = by_shift
         return weigh @ out
 
+    # effects, and derivatives by station, platform and mount
     eye, by_columns = np.eye(3), weigh @ data.columns
-    numbers = with_zero(columns)[:, blocks.column]  # the last is none's
+    numbers = with_zero(columns)[:, blocks.column]  # the last one is for padding
     value = (weigh @ error[..., None] + by_columns @ numbers[..., None])[..., 0]
     return PoseRows(
         value,

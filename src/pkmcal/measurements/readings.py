@@ -16,8 +16,9 @@ from pkmcal.measurements.contract import MotorKind
 from pkmcal.mechanisms.layout import LimbLayout
 
 PERFECT_CLOSURE_SIGMA = 1e-6
-"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of a
-good encoder's noise, which loses no information, and large enough to keep digits."""
+"""Standard deviation (m) of closures without a reading: joints and rods without play. It is a third
+of a good encoder's noise, so that no information is lost, and large enough for the conditioning of
+the normal equations."""
 
 
 @final
@@ -34,7 +35,11 @@ class Readings(MotorKind):
 
 @dataclass(frozen=True)
 class ReadingColumns:
-    """Columns that change the readings: by (K, m, c), and which of the estimate's each is, (c,)."""
+    """Effects that change the readings.
+
+    by : (K, m, c) derivatives of the readings.
+    column : (c,) numbers of the effects.
+    """
 
     by: Array
     column: Integers
@@ -44,15 +49,16 @@ class ReadingColumns:
         return replace(self, by=self.by[configurations])
 
     def corrected(self, joints: Array, columns: Array) -> Array:
-        """Readings (B, K, m) as they should have been at numbers (B, n) of the columns."""
+        """Readings (B, K, m) without the effects, whose numbers are ``columns`` (B, n)."""
         if not len(self.column):
             return joints
         return joints + np.einsum("kmc,bc->bkm", self.by, columns[:, self.column])
 
 
 def closures_by_readings(layout: LimbLayout, by_reading: Array, by: Array) -> Array:
-    """Derivatives (B, K, E, k) of the closures, with slopes (B, K, E), where the readings change by
-    ``by`` (K, m, k).
+    """Derivatives (B, K, E, k) of the closures by k changes of the readings.
+
+    by_reading : (B, K, E) slopes of the closures. by : (K, m, k) changes of the readings.
     """
     driven = layout.row_motor >= 0
     slope = np.where(driven, by_reading, 0.0)[..., None]
@@ -60,12 +66,13 @@ def closures_by_readings(layout: LimbLayout, by_reading: Array, by: Array) -> Ar
 
 
 def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Array) -> Array:
-    """Rows (..., E, n) of the closure in standard deviations; the noise's own derivative is
-    multiplied by c = 0.
+    """Rows (..., E, n) of the closure in standard deviations.
 
-    joint_noise : what by_reading (..., E) broadcasts with. Rods on one motor share its reading's
-    noise: with slopes g of the motor's rows their covariance is ``sigma^2 g g^T +
-    PERFECT_CLOSURE_SIGMA^2``, whitened in closed form.
+    The derivative of the noise is neglected; it would be multiplied by the closure, which is about
+    zero. Rods on one motor share its reading's noise: with the slopes g of the motor's rows their
+    covariance is ``sigma^2 g g^T + PERFECT_CLOSURE_SIGMA^2``, whitened in closed form.
+
+    joint_noise : standard deviation of a reading, broadcasts with by_reading (..., E).
     """
     if not layout.shares_motors:
         return rows / closure_sigma(layout, joint_noise, by_reading)[..., None]
@@ -81,9 +88,10 @@ def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Ar
 def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> Array:
     """Standard deviation (..., E) of each closure where every motor moves one rod.
 
-    A crank in line with its rod does not move it, so no closure is sharper than a perfect one; a
-    rod that is read always moves with its reading, whose noise is one of lengths: told by its
-    scale, it would be the same but for a thousandth, and change with an unknown.
+    A crank in line with its rod does not move it, so the standard deviation is at least that of a
+    closure without a reading. A rod that is read moves with its reading, and the noise of the
+    reading is used as one of lengths, without its scale: the difference is a thousandth, and the
+    noise does not depend on an unknown.
     """
     if layout.reads_lengths:
         return np.where(layout.row_motor >= 0, joint_noise, PERFECT_CLOSURE_SIGMA)
@@ -93,8 +101,9 @@ def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> 
 
 
 def least_joint_noise(layout: LimbLayout, by_reading: Array) -> Array:
-    """Noise of the readings (B,) below which no closure counts more, for slopes (B, K, E); 0 where
-    a rod is read, whose closure is as sharp as its reading.
+    """Noise of the readings (B,) below which no closure gains weight, for slopes (B, K, E).
+
+    0 where a rod is read, since its closure then has the noise of its reading.
     """
     if layout.rod_reads[layout.closing].any() and not layout.shares_motors:
         return np.zeros(len(by_reading))
@@ -103,7 +112,7 @@ def least_joint_noise(layout: LimbLayout, by_reading: Array) -> Array:
 
 
 def joint_rows(layout: LimbLayout, by_reading: Array, rows: Array) -> Array:
-    """Whitened closure rows (..., E) as one a reading, (..., m)."""
+    """Whitened closure rows (..., E) as one row per reading, (..., m)."""
     if not layout.shares_motors:
         driven = layout.driven_rows
         order = np.argsort(layout.row_motor[driven], kind="stable")

@@ -14,11 +14,10 @@ Numbers = TypeVar("Numbers")
 
 
 class RowGroups(NamedTuple, Generic[Item]):
-    """One value for each group of rows: edges, poses (of boards and targets), and links. Several
-    kinds of measurement share a group.
+    """One value for each group of rows: edges, poses (of boards and targets), and links.
 
-    An estimate weighs, counts and scales all of these in the same way. Readings are not among them,
-    since they have no robust weight.
+    Several kinds of measurement share a group. An estimate weights, counts and scales all groups in
+    the same way. Readings are not a group, since they have no robust weight.
     """
 
     edges: Item
@@ -33,7 +32,7 @@ class RowGroups(NamedTuple, Generic[Item]):
 class RowGroup:
     """Rows of one group in a problem.
 
-    rows : their slice among a configuration's rows.
+    rows : slice among a configuration's rows.
     present : (K, G) False for padding.
     weight : (B or 1, K, G).
     whiten : (B or 1, K, G, n, n).
@@ -46,7 +45,7 @@ class RowGroup:
 
     @property
     def count(self) -> Integers:
-        """Number of residuals of each measurement, (K, G): six for a board's pose, three for a
+        """Number (K, G) of residuals of each measurement: six for a board's pose, three for a
         point, none for padding.
         """
         return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)

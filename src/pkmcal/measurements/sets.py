@@ -1,4 +1,4 @@
-"""Measurements of all kinds together: plain, frozen data."""
+"""All measurements of a session: plain, frozen data."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Observation:
     edges : silhouette edges.
     rejected : measurements that were rejected, with their reasons.
     points, point_edge : (M, 2) sub-pixel edge points (px), and the edge that each supports, for
-        pictures and residuals.
+        plots and residuals.
     T_camera_base : (S, 4, 4) poses of the stations after the search.
     poses : of boards, and of trackers' targets.
     binning : (S,) pixels of each station's images, across and down, that were averaged to one for
@@ -73,10 +73,10 @@ def of_stations(edges: Mapping[int, EdgeSet]) -> EdgeSet:
 
 @dataclass(frozen=True)
 class Mount:
-    """The body to which a board or a tracker's target is fixed; its pose there is estimated.
+    """Body to which a board or a tracker's target is fixed; its pose on the body is estimated.
 
-    tolerance : prior sigma of a board's size, relative: all squares are larger or smaller by one
-    factor, which is estimated.
+    tolerance : prior sigma of a board's relative size: one factor on all squares, which is
+        estimated.
     """
 
     name: str
@@ -88,19 +88,26 @@ class Mount:
 class Measurements:
     """All measurements of a session, with their stated noise.
 
-    edges : silhouette edges. joints : (K, m) readings, m or rad. joint_noise : their
-    standard deviation. n_stations : S. camera_of_station : (S,) number of the camera (file)
-    that each station uses: one edge shift is estimated for each camera. intrinsics_factor :
-    (C, n, r) square roots F of the cameras' intrinsics' covariances F F^T, where these are to be
-    refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
-    those units from the calibration's values. poses : of boards or targets, each on one of the
-    ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
-    gives edges in images. focal_at : (S,) relative excess of the stations' focal lengths at
-    which they were measured; empty where none is held by hand. effects : further effects beside
-    those that every estimate counts (:mod:`pkmcal.measurements.effects`). links : measurements that
-    link two configurations, one set for each kind. level : (S,) stations whose z
-    axis is the base's, exactly; empty where there is none. imputation_covariance : by what part of
-    its variance by noise a result varies besides, with where its edges were looked for.
+    edges : silhouette edges.
+    joints, joint_noise : (K, m) readings, m or rad, and their standard deviation.
+    n_stations : number of stations, S.
+    camera_of_station : (S,) number of the camera (file) of each station. One edge shift is
+        estimated for each camera.
+    intrinsics_factor : (C, n, r) square roots F of the covariances F F^T of the cameras'
+        intrinsics, if these are refined; r = 0 if they are held.
+    intrinsics_at : (C, r) intrinsics with which the edges were measured, as changes from the
+        calibration's values in units of F.
+    poses : of boards or targets, each on one of the ``mounts``.
+    shaded : whether each side of a tube has, at each station, an unknown shift by shading, as edges
+        in images have.
+    focal_at : (S,) relative excess of the stations' focal lengths with which they were measured;
+        empty without hand-held cameras.
+    effects : further effects in addition to those of every estimate
+        (:mod:`pkmcal.measurements.effects`).
+    links : measurements that link two configurations, one set for each kind.
+    level : (S,) stations whose z axis is exactly the base's; empty if there is none.
+    imputation_covariance : variance of a result with the prediction from which edges were measured,
+        relative to its variance by noise.
     """
 
     edges: EdgeSet
@@ -133,7 +140,7 @@ class Measurements:
         return np.concatenate([none, *(links.configuration for links in self.links)])
 
     def link_at(self, number: int) -> tuple[LinkSet, int]:
-        """Set of a link, from its number among all links, and its number in the set."""
+        """Set that contains a link, from the link's number among all, and its number in the set."""
         for links in self.links:
             if number < len(links):
                 return links, number
@@ -141,12 +148,12 @@ class Measurements:
         raise IndexError(number)
 
     def links_among(self, keep: Booleans) -> Booleans:
-        """(n,) links whose configurations are both to be kept; keep : (K,)."""
+        """Mask (n,) of the links between configurations that are both in ``keep`` (K,)."""
         first, second = self.link_ends.T
         return keep[first] & keep[second]
 
     def with_links(self, keep: Booleans) -> Measurements:
-        """The measurements with some of the links; keep : (n,)."""
+        """Measurements with some of the links; keep : (n,)."""
         ends = np.cumsum([len(links) for links in self.links]).tolist()
         parts = [
             links.select(keep[end - len(links) : end])

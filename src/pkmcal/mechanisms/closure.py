@@ -7,7 +7,8 @@ There are E rows, the lengths of the legs that close, then the axes' equations, 
     (B - A) . w        (arm x w, w)   w . dB    -w . dA           of A, B, two axes
 
 A screw that the joints turn adds lead / (2 pi) phi to its leg's first row, which then depends on
-two axes as well (:func:`~pkmcal.mechanisms.joints.screw_rows`).
+two axes as well (:func:`~pkmcal.mechanisms.joints.screw_rows`), and so do universal joints whose
+axes do not meet (:func:`~pkmcal.mechanisms.joints.offset_rows`).
 
 (w of an axis on the platform rotates with the pose, which adds a term in omega.)
 
@@ -33,7 +34,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.batches import fresh, moments
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import by_pose
-from pkmcal.mechanisms.joints import AngleRows, angle_rows, screw_rows
+from pkmcal.mechanisms.joints import AngleRows, angle_rows, offset_rows, screw_rows
 from pkmcal.mechanisms.layout import CarrierGroup, LimbLayout
 
 
@@ -173,8 +174,8 @@ def rows_between(
         distance=distance,
         w=u[..., :0, :],
     )
-    if len(layout.screws):
-        rows = _with_screws(layout, theta, poses, line, platform, rows)
+    if layout.growing.size:
+        rows = _with_growth(layout, theta, poses, line, platform, rows)
     if not layout.all_close:
         rows = rows._replace(
             value=rows.value[..., layout.closing],
@@ -190,12 +191,12 @@ def limb_lines(base: BaseEnds, platform: PlatformEnds) -> tuple[Array, Array]:
     return line, np.sqrt(dot(line, line))
 
 
-def _with_screws(
+def _with_growth(
     layout: LimbLayout, theta: Array, poses: Array, line: Array, platform: PlatformEnds, rows: Rows
 ) -> Rows:
-    """Rows of all legs' lengths with what screws add to them."""
-    leg = layout.screws.leg
-    turned = screw_growth(layout, theta, poses, line)
+    """Rows of all legs' lengths with what screws and offset axes add to them."""
+    leg = layout.growing
+    turned = rod_growth(layout, theta, poses, line)
     by_pose = _by_pose(platform.arm[..., leg, :], turned.by_line)
     by_pose[..., :3] += turned.by_turn
     rows.value[..., leg] += turned.value
@@ -206,12 +207,20 @@ def _with_screws(
     return rows
 
 
-def screw_growth(layout: LimbLayout, theta: Array, poses: Array, line: Array) -> AngleRows:
-    """Excess of a screw's reading over its rod's length, with derivatives.
+def rod_growth(layout: LimbLayout, theta: Array, poses: Array, line: Array) -> AngleRows:
+    """Excess of the readings over |B - A| of the legs ``layout.growing``, with derivatives.
 
     line : (..., L, 3) B - A of all legs, m.
     """
-    return screw_rows(layout.screws, theta, poses[..., :3, :3], line[..., layout.screws.leg, :])
+    rot, parts = poses[..., :3, :3], list[AngleRows]()
+    if len(layout.screws):
+        parts.append(screw_rows(layout.screws, theta, rot, line[..., layout.screws.leg, :]))
+    if len(layout.offsets):
+        parts.append(offset_rows(layout.offsets, theta, rot, line[..., layout.offsets.leg, :]))
+    if len(parts) == 1:
+        return parts[0]
+    value, *others = zip(*parts, strict=True)
+    return AngleRows(np.concatenate(value, axis=-1), *(np.concatenate(x, axis=-2) for x in others))
 
 
 def _with_angles(
@@ -465,9 +474,9 @@ class Closure(LimbEnds):
     def _by_length(self) -> Array:
         """Derivatives of |B - A| - length, for the legs that close."""
         layout, slope, axes = self.layout, self.rows.u, ()
-        if len(layout.screws):
-            leg = layout.screws.leg
-            turned = screw_growth(layout, self.theta, self.poses, self.b - self.a)
+        if layout.growing.size:
+            leg = layout.growing
+            turned = rod_growth(layout, self.theta, self.poses, self.b - self.a)
             slope = np.array(slope)
             slope[..., leg, :] += turned.by_line
             by_axes = np.zeros((*slope.shape[:-1], 6))

@@ -218,7 +218,54 @@ class Leg(Schema):
         float,
         Field(gt=0.5, lt=2, description="the reading's true value over the reading, such as 1.0"),
     ] = 1.0
+    stiffness: (
+        Annotated[
+            float,
+            Field(gt=0, le=1e15, description="the drive's stiffness, N/m (of a crank N m/rad), such"
+                  " as 2.0e6"),
+        ]
+        | None
+    ) = None  # fmt: skip
     tubes: Annotated[tuple[Tube, ...], Field(max_length=MOST_LEG_TUBES)] = ()
+
+
+class Load(Schema):
+    """Weight on the platform, under which drives yield by their legs' ``stiffness``.
+
+    mass : kg, of the platform with all that it carries. center : its centre, platform frame, m.
+    gravity : m/s^2, base frame.
+    """
+
+    mass: Annotated[float, Field(gt=0, le=1e6, description="the mass in kg, such as 12")]
+    center: Point = (0.0, 0.0, 0.0)
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+
+
+STIFFNESS_TOLERANCE = 0.3
+"""Default prior sigma of all drives' compliance, relative: joints and bearings yield, too."""
+STEEL_EXPANSION = 11.5e-6
+"""Relative growth of steel's length, 1/K: the prior sigma of a machine's growth."""
+Growing = Annotated[
+    float, Field(ge=-1e-3, le=1e-3, description="growth per kelvin, such as 11.5e-6")
+]
+
+
+class Growth(Schema):
+    """Thermal growth of lengths relative to those of the file, 1/K.
+
+    temperature : of the file's lengths, °C. drives : of
+    screws, racks and their zeros. frame : of joint centres, arms and rods of constant length.
+    sigma : standard deviations of drives and frame; correlation : of the two.
+    """
+
+    temperature: Annotated[float, Field(ge=-300, le=2000)]
+    drives: Growing = 0.0
+    frame: Growing = 0.0
+    sigma: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (
+        STEEL_EXPANSION,
+        STEEL_EXPANSION,
+    )
+    correlation: Annotated[float, Field(gt=-1, lt=1)] = 0.0
 
 
 TOLERANCE_RANGE = Field(ge=1e-12)
@@ -238,6 +285,7 @@ class NominalTolerance(Schema):
     arm: Annotated[Metres, TOLERANCE_RANGE] = 0.001
     angle: Annotated[Radians, Field(ge=1e-12, lt=1)] = 0.02
     scale: Annotated[Share, Field(ge=0, lt=0.1)] | None = None
+    stiffness: Annotated[Share, Field(gt=0, le=10)] | None = None
 
 
 class Home(Schema):
@@ -313,6 +361,8 @@ class MechanismDocument(Schema):
         ]
         | None
     ) = None
+    load: Load | None = None
+    growth: Growth | None = None
     fixed: tuple[str, ...] = ()
     tied: Ties = ()
     models: dict[str, DocumentModel] = Field(default_factory=dict)

@@ -19,6 +19,7 @@ from pkmcal.mechanisms.carriers.contract import (
     IN_PLANE,
     PLANAR_MOTIONS,
     Site,
+    Winding,
     base_carriers,
     platform_carriers,
 )
@@ -29,7 +30,7 @@ from pkmcal.mechanisms.document import (
     MechanismDocument,
     PassiveLength,
 )
-from pkmcal.mechanisms.joints import equations, screws
+from pkmcal.mechanisms.joints import equations, joint_offsets, screws
 from pkmcal.mechanisms.motors import bodies, motor_columns, sharing
 from pkmcal.wording import listed
 
@@ -52,6 +53,7 @@ def check_nominal(document: MechanismDocument, where: PlaceInDocument | None = N
         if document.motion in ("translation", "planar-translation"):
             _check_parallel(j, leg, place)
         _check_screw(document, j, leg, place)
+        _check_offsets(document, j, leg, place)
         if base.driven and not isinstance(leg.length, ConstantLength):
             raise InputError(
                 f"leg {j + 1} is moved by its {leg.base.joint}, so its rod has one length",
@@ -67,6 +69,7 @@ def check_nominal(document: MechanismDocument, where: PlaceInDocument | None = N
         )
     _check_motors(document, place)
     _check_scales(document, place)
+    _check_load(document, place)
     for side, legs, fields in sharing(document):
         for field in fields:
             _check_equal(document, side, legs, field, place)
@@ -88,6 +91,31 @@ def _check_screw(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDo
             found=f"{leg.base.joint} and {leg.platform.joint}, motion: {document.motion}",
             expected="motion: spatial, and joint: universal with axis: [x, y, z] at both ends",
             next_step="Give both joints' axes, or leave out lead",
+        )
+
+
+def _check_offsets(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDocument) -> None:
+    """Check that a leg with joints whose axes do not meet is a rod between fixed joints of a
+    spatial machine, and is measured in no image.
+    """
+    if j not in joint_offsets(document):
+        return
+    base = base_carriers()[leg.base.joint]
+    if document.motion != "spatial" or base.driven or issubclass(base, Winding):
+        raise InputError(
+            f"leg {j + 1} has a joint whose axes do not meet, which only rods between fixed joints"
+            " of spatial machines can have",
+            where=place("legs", j),
+            found=f"base: {leg.base.joint}, motion: {document.motion}",
+            expected="motion: spatial, and a base joint that no motor moves",
+        )
+    if leg.tubes:
+        raise InputError(
+            f"leg {j + 1} has a joint whose axes do not meet: where its tubes are in images is not"
+            " modelled",
+            where=place("legs", j, "tubes"),
+            expected="no tubes",
+            next_step="Leave them out, and observe a board on the platform, or use a tracker",
         )
 
 
@@ -168,6 +196,54 @@ def _check_scales(document: MechanismDocument, place: PlaceInDocument) -> None:
             )
 
 
+def _check_load(document: MechanismDocument, place: PlaceInDocument) -> None:
+    """Check that a load's forces on the drives follow from statics, and that all drives have a
+    stiffness or none.
+    """
+    columns, legs = motor_columns(document), document.legs
+    stated = any(leg.stiffness is not None for leg in legs)
+    for j, leg in enumerate(legs):
+        first = legs[int(np.argmax(columns == columns[j]))]
+        right = (leg.stiffness is not None) == (stated and columns[j] >= 0)
+        if not right or (columns[j] >= 0 and leg.stiffness != first.stiffness):
+            raise InputError(
+                f"the stiffness of leg {j + 1} does not suit its drive",
+                where=place("legs", j, "stiffness"),
+                found=str(leg.stiffness),
+                expected="a stiffness for each leg that a motor moves, equal for legs on one motor,"
+                " or for none",
+            )
+    if stated and document.load is None:
+        raise InputError(
+            "drives have a stiffness, but there is no load under which they yield",
+            where=place("load"),
+            expected="load: {mass: the mass on the platform in kg, center: [x, y, z]}",
+        )
+    if document.load is not None and n_equations(document) > n_freedoms(document):
+        raise InputError(
+            "a load's forces on more legs than the platform has freedoms do not follow from"
+            " statics",
+            where=place("load"),
+            found=f"{n_equations(document)} equations for {n_freedoms(document)} freedoms",
+            expected="as many equations as freedoms",
+            next_step="Leave out load",
+        )
+
+
+def n_equations(document: MechanismDocument) -> int:
+    """Number of closure equations: lengths of all but passive legs, and axes' equations."""
+    passive = sum(isinstance(leg.length, PassiveLength) for leg in document.legs)
+    return len(document.legs) - passive + len(equations(document))
+
+
+def n_freedoms(document: MechanismDocument) -> int:
+    """Number of freedoms of the platform and its hinges."""
+    joints = [leg.platform.joint for leg in document.legs]
+    turning = [j for j, joint in enumerate(joints) if platform_carriers()[joint].turns]
+    hinges = len(set(bodies(document)[turning].tolist()))
+    return MOTION_DIRECTIONS[document.motion].shape[1] + hinges
+
+
 def _check_equal(
     document: MechanismDocument,
     side: str,
@@ -199,11 +275,7 @@ def _check_equations(document: MechanismDocument, place: PlaceInDocument) -> Non
     passive = [
         j + 1 for j, leg in enumerate(document.legs) if isinstance(leg.length, PassiveLength)
     ]
-    count = len(document.legs) - len(passive) + len(equations(document))
-    joints = [leg.platform.joint for leg in document.legs]
-    turning = [j for j, joint in enumerate(joints) if platform_carriers()[joint].turns]
-    hinges = len(set(bodies(document)[turning].tolist()))
-    freedoms = MOTION_DIRECTIONS[document.motion].shape[1] + hinges
+    count, freedoms = n_equations(document), n_freedoms(document)
     if count >= freedoms:
         return
     why = ""
@@ -211,12 +283,14 @@ def _check_equations(document: MechanismDocument, place: PlaceInDocument) -> Non
         one = len(passive) == 1
         why = f"; {'leg' if one else 'legs'} {listed([str(j) for j in passive])}, passive, "
         why += "holds nothing" if one else "hold nothing"
-    kinds = dict.fromkeys(f"{joints[j].replace('-', ' ')}s" for j in turning)
+    joints = dict.fromkeys(leg.platform.joint for leg in document.legs)
+    kinds = [f"{x.replace('-', ' ')}s" for x in joints if platform_carriers()[x].turns]
     raise InputError(
         f"the legs do not hold the platform: {count} equations for {freedoms} freedoms{why}",
         where=place("legs"),
         expected="one equation a leg with a length, one a revolute joint, one a pair of universal "
         f"joints with axes; {freedoms} for motion: {document.motion}"
-        f"{f' and its {listed(list(kinds))}' if kinds else ''}",
-        next_step="Add legs or axes, or correct motion",
+        f"{f' and its {listed(kinds)}' if kinds else ''}",
+        next_step="Add legs or axes, or correct motion; a platform that its weight holds as well,"
+        " as on few cables, is not modelled",
     )

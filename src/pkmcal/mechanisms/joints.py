@@ -19,6 +19,14 @@ from the base's axis to the platform's, both seen along u. Axes are lines, so ph
 
     tan phi = s / c,   s = u . (v x R v'),   c = v . R v' - (v . u) (R v' . u)
 
+A universal joint's second axis may lie at a distance e from its first one v, towards the leg's
+other end. The rod then runs from A' = A + e n to B' = B + e' n', with n the direction square to v
+from A to B', and n' that square to R v' from B to A': each second axis is square to its first one
+and to the rod. The reading contains ``|B' - A'| - |B - A|``, nearly -e cos(beta) for the rod's
+angle beta out of the plane square to v. With u' the rod's direction, |B' - A'| is stationary in
+both joints' angles, so that its derivatives are those of a rod whose ends are fixed to their
+bodies.
+
 Planar and translational machines move as their file states, so axes add no equations.
 """
 
@@ -35,6 +43,9 @@ from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
 from pkmcal.mechanisms.document import ActuatedLength, MechanismDocument
 
+OFFSET_TURNS = 12
+"""Turns in which a rod's two offset ends are computed: rounding is left where offsets are up to a
+twentieth of the leg."""
 JOINT_AXIS_KINDS = tuple(ParameterKind(f"axis.{axis}", "1", "axis") for axis in "xyz")
 
 Equation = Literal["revolute base", "revolute platform", "torsion"]
@@ -67,9 +78,15 @@ def screws(document: MechanismDocument) -> dict[int, float]:
     }
 
 
+def joint_offsets(document: MechanismDocument) -> dict[int, tuple[float, float]]:
+    """Offsets, m, of the axes of universal joints on base and platform, by leg from 0."""
+    ends = ([getattr(x, "offset", None) for x in (leg.base, leg.platform)] for leg in document.legs)
+    return {j: (a or 0.0, b or 0.0) for j, (a, b) in enumerate(ends) if a or b}
+
+
 def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:
-    """Ends (leg from 0, side) whose axis is in an equation or a screw's twist and hence a
-    parameter.
+    """Ends (leg from 0, side) whose axis is in an equation, a screw's twist or an offset joint and
+    hence a parameter.
     """
     sides: dict[Equation, tuple[str, ...]] = {
         "revolute base": ("base",),
@@ -77,7 +94,14 @@ def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:
         "torsion": ("base", "platform"),
     }
     in_equations = {(j, side) for j, which in equations(document) for side in sides[which]}
-    return in_equations | {(j, side) for j in screws(document) for side in sides["torsion"]}
+    in_offsets = {
+        (j, side)
+        for j, each in joint_offsets(document).items()
+        for side, offset in zip(sides["torsion"], each, strict=True)
+        if offset
+    }
+    of_screws = {(j, side) for j in screws(document) for side in sides["torsion"]}
+    return in_equations | in_offsets | of_screws
 
 
 @dataclass(frozen=True)
@@ -121,10 +145,26 @@ class ScrewLayout:
         return np.concatenate([self.base, self.platform], axis=1)
 
 
+@dataclass(frozen=True)
+class OffsetLayout:
+    """Legs (S of them) with universal joints whose axes do not meet.
+
+    leg : (S,). offset : (S, 2) m, of the joints on base and platform, zero where axes meet.
+    axis : (S, 2, 3) indices of their first axes' parameters, -1 where axes meet.
+    """
+
+    leg: Integers
+    offset: Array
+    axis: Integers
+
+    def __len__(self) -> int:
+        return len(self.leg)
+
+
 class AngleRows(NamedTuple):
-    """Angle equations, or changes of screws' readings: values (..., E), m, and derivatives
-    (..., E, 3) by the limb's line, by the platform's rotation, and by the parameters of the base
-    and platform axes.
+    """Angle equations, or changes of readings by screws and offset axes: values (..., E), m, and
+    derivatives (..., E, 3) by the limb's line, by the platform's rotation, and by the parameters of
+    the base and platform axes.
     """
 
     value: Array
@@ -161,6 +201,54 @@ def screw_layout(document: MechanismDocument, base: Integers, platform: Integers
     leads = screws(document)
     leg = np.array(list(leads), dtype=int)
     return ScrewLayout(leg, np.array(list(leads.values())), base[leg], platform[leg])
+
+
+def offset_layout(document: MechanismDocument, base: Integers, platform: Integers) -> OffsetLayout:
+    """Offset joints of a document.
+
+    base, platform : (L, 3) indices of the axes' parameters, -1 for none.
+    """
+    each = joint_offsets(document)
+    leg = np.array(list(each), dtype=int)
+    offset = np.array(list(each.values()), dtype=float).reshape(-1, 2)
+    axis = np.stack([base[leg], platform[leg]], axis=1)
+    return OffsetLayout(leg, offset, np.where(offset[..., None] != 0, axis, -1))
+
+
+def offset_rows(layout: OffsetLayout, theta: Array, rot: Array, line: Array) -> AngleRows:
+    """Changes of readings by offset axes, |B' - A'| - |B - A|; see the module's docstring.
+
+    theta : (..., P).
+    rot : (..., 3, 3) rotation of the platform.
+    line : (..., S, 3) B - A of each leg, m.
+    """
+    offset_a, offset_b = layout.offset[:, :1], layout.offset[:, 1:]
+    index = np.maximum(layout.axis, 0)
+    v, v_size = _unit(theta[..., index[:, 0]], offset_a != 0)
+    own, own_size = _unit(theta[..., index[:, 1]], offset_b != 0)
+    w = (rot[..., None, :, :] @ own[..., None])[..., 0]
+    # A' and B' by turns, from A: each turn is as much better as offsets are shorter than the leg
+    n, n_platform = _direction(_across(line, v)), _direction(_across(-line, w))
+    for _ in range(OFFSET_TURNS):
+        n = _direction(_across(line + offset_b * n_platform, v))
+        n_platform = _direction(_across(offset_a * n - line, w))
+    start, end = offset_a * n, line + offset_b * n_platform
+    rod = end - start
+    length, distance = np.sqrt(dot(rod, rod)), np.sqrt(dot(line, line))
+    u = rod / length[..., None]
+    by_own = -offset_b * dot(u, w)[..., None] * n_platform
+    return AngleRows(
+        value=length - distance,
+        by_line=u - line / distance[..., None],
+        by_turn=cross(end - line, u),
+        by_base_axis=offset_a * dot(u, v)[..., None] * n / v_size,
+        by_platform_axis=(rot.mT[..., None, :, :] @ by_own[..., None])[..., 0] / own_size,
+    )
+
+
+def _direction(vector: Array) -> Array:
+    """Unit vectors (..., 3)."""
+    return vector / np.sqrt(dot(vector, vector))[..., None]
 
 
 def screw_turns(layout: ScrewLayout, theta: Array, rot: Array, line: Array) -> Array:

@@ -36,10 +36,10 @@ from pkmcal.mechanisms.closure import (
     limb_lines,
     platform_ends,
     platform_parameters,
+    rod_growth,
     rod_lengths,
     rows_between,
     scales,
-    screw_growth,
 )
 from pkmcal.mechanisms.layout import LimbLayout
 
@@ -339,9 +339,9 @@ def _leg_readings(
     at_zero = base_ends(layout, theta, np.zeros(layout.n_readings))
     at_zero = at_tangents(layout, theta, at_zero, platform)
     line, distance = limb_lines(at_zero, platform)
-    if len(layout.screws):
+    if layout.growing.size:
         distance = np.array(distance)
-        distance[..., layout.screws.leg] += screw_growth(layout, theta, poses, line).value
+        distance[..., layout.growing] += rod_growth(layout, theta, poses, line).value
     # A rod on a fixed centre is linear in its reading.
     out, scale = np.where(layout.rod_reads, distance - at_zero.length, 0.0), scales(layout, theta)
     for group in layout.base:

@@ -24,8 +24,10 @@ from pkmcal.mechanisms.document import (
 from pkmcal.mechanisms.joints import (
     JOINT_AXIS_KINDS,
     AngleLayout,
+    OffsetLayout,
     ScrewLayout,
     angle_layout,
+    offset_layout,
     screw_layout,
 )
 from pkmcal.mechanisms.motors import bodies, middles, motor_columns
@@ -81,7 +83,7 @@ class LimbLayout:
     base_axis, platform_axis : (L, 3) indices of the axes' parameters, -1 for an axis that is not a
         parameter.
     angles : the axes' equations.
-    screws : the screws that joints turn.
+    screws : the screws that joints turn. offsets : universal joints whose axes do not meet.
     turning : indices (n, 3) of all direction vectors among the parameters, in the base frame and in
         the platform frame.
     radius : (tubes,) indices of the radii, for each leg.
@@ -104,6 +106,7 @@ class LimbLayout:
     platform_axis: Integers
     angles: AngleLayout
     screws: ScrewLayout
+    offsets: OffsetLayout
     turning: tuple[Integers, Integers]
     radius: tuple[Integers, ...]
     motion: Array
@@ -181,7 +184,14 @@ class LimbLayout:
     @cached_property
     def rods_alone(self) -> bool:
         """Whether distances of joint centres are all of the closure: no axis is in it."""
-        return not len(self.angles) and not len(self.screws)
+        return not len(self.angles) and not self.growing.size
+
+    @cached_property
+    def growing(self) -> Integers:
+        """Legs (S,) whose readings contain more than their length and offset: those with screws
+        that joints turn, then those with joints whose axes do not meet.
+        """
+        return np.concatenate([self.screws.leg, self.offsets.leg])
 
     @cached_property
     def own_motion(self) -> Array:
@@ -258,11 +268,14 @@ class LimbLayout:
         parts = [self.a_index, self.b_index, rod]
         if self.scales_move_rods:
             parts.append(np.where(self.rod_reads, self.scale, none)[:, None])
-        if len(self.screws):
+        if self.growing.size:
             turned = np.full((self.n_legs, 6), none)
-            turned[self.screws.leg] = self.screws.axes
+            of_offsets = self.offsets.axis.reshape(-1, 6)
+            axes = [self.screws.axes, np.where(of_offsets < 0, none, of_offsets)]
+            turned[self.growing] = np.concatenate(axes)
             parts.append(turned)
-        # Rows of lengths: A, B, rod, the rod's scale, and the axes that turn a screw.
+        # Rows of lengths: A, B, rod, the rod's scale, and the axes that turn a screw or are
+        # offset.
         lengths = np.concatenate(parts, axis=1)[keep]
         # Rows of axes: A, B and the two axes.
         angles = np.concatenate(
@@ -339,6 +352,7 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         platform_axis=platform_axis,
         angles=angle_layout(document, base_axis, platform_axis),
         screws=screw_layout(document, base_axis, platform_axis),
+        offsets=offset_layout(document, base_axis, platform_axis),
         turning=(
             _direction_index(document, "base", positions),
             _direction_index(document, "platform", positions),

@@ -29,7 +29,7 @@ from pkmcal.mechanisms.document import (
     PassiveLength,
 )
 from pkmcal.mechanisms.document_checks import check_nominal
-from pkmcal.mechanisms.joints import JOINT_AXIS_KINDS, axes_in_use
+from pkmcal.mechanisms.joints import JOINT_AXIS_KINDS, axes_in_use, offset_rows
 from pkmcal.mechanisms.layout import LimbLayout, layout_of
 from pkmcal.mechanisms.motors import (
     built_in_fixed,
@@ -146,6 +146,19 @@ class Machine:
         """Copy with the same parameters whose readings are lengths: no joint turns a screw."""
         screws = replace(self.layout.screws, lead=np.zeros(len(self.layout.screws)))
         return replace(self, layout=replace(self.layout, screws=screws))
+
+    def with_meeting_axes(self, poses: Array) -> Machine:
+        """Copy whose universal joints have one centre each; what offsets of their axes take from a
+        rod's length is, in the mean over poses (n, 4, 4), in its offset or constant length.
+        """
+        layout, values = self.layout, self.values.copy()
+        ends = limb_ends(layout, values, self.middle_readings(), poses)
+        rot, leg = poses[..., :3, :3], layout.offsets.leg
+        growth = offset_rows(layout.offsets, values, rot, (ends.b - ends.a)[..., leg, :]).value
+        rod = layout.rod[leg]
+        values[rod[rod >= 0]] -= growth.mean(axis=0)[rod >= 0]
+        none = replace(layout.offsets, offset=np.zeros_like(layout.offsets.offset))
+        return replace(self, layout=replace(layout, offsets=none), values=values)
 
     @cached_property
     def size(self) -> float:

@@ -1,13 +1,13 @@
 """Background of hand-held images: points of the room that several images share.
 
 A machine of equal parts looks nearly the same from several sides; the room around it does not.
-Feature points that two images share lie on each other's epipolar lines if both cameras are where
-they are assumed to be, and anywhere otherwise. Each candidate pose of an image is therefore scored
-by how well the room agrees with the images whose poses are already accepted.
+Feature points that two images share lie on each other's epipolar lines if the relative pose of the
+cameras is correct, and anywhere otherwise. Each candidate pose of an image is therefore scored by
+how well the room agrees with the images whose poses are already accepted.
 
-Points on the machine are excluded: they move with it, and a machine with symmetric parts agrees
-with itself from both sides. Features are Lowe's SIFT (International Journal of Computer Vision 60,
-2004) with square-rooted descriptors (Arandjelovic and Zisserman, CVPR 2012).
+Points on the machine are excluded: they move with it, and a machine with symmetric parts is
+consistent with itself from several sides. Features are Lowe's SIFT (International Journal of
+Computer Vision 60, 2004) with square-rooted descriptors (Arandjelovic and Zisserman, CVPR 2012).
 """
 
 from __future__ import annotations
@@ -342,7 +342,7 @@ class Surroundings:
     def place(self, one: int, landmarks: Mapping[int, Landmarks]) -> Array:
         """Camera pose T_camera_base (0 or 1, 4, 4) of an image from its matches with landmarks.
 
-        P3P in RANSAC, refined on the inliers; empty with fewer than the options' fewest of them.
+        P3P in RANSAC, refined on the inliers; empty with fewer inliers than the options require.
         """
         import cv2
 

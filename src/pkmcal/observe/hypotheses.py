@@ -2,13 +2,13 @@
 
 The hypotheses are all mistakes in the readings (:mod:`pkmcal.mechanisms.reading_hypotheses`),
 exchanged stations, images under other names, mirrored images, and diameters in place of radii.
-Levels of evidence compare their log-likelihoods with that of the session as stated: a short search
-in few images, the same search in all images, and a full search for the likeliest hypotheses, from
-whose poses all are compared. Hypotheses are compared for localized machines as well: with two
-columns exchanged, four legs of six still fit.
+Their log-likelihoods are compared with that of the session as stated at several levels of evidence:
+a short search in few images, the same search in all images, and a full search for the likeliest
+hypotheses, after which all are compared from the same poses. Hypotheses are compared for localized
+machines as well: with two columns exchanged, four legs of six still fit.
 
-A search gives a lower bound of the likelihood, because it may end beside the best pose. Before the
-full search, hypotheses are therefore dropped by their order alone.
+A search gives a lower bound of the likelihood, because it may end at a local maximum. Before the
+full search, hypotheses are therefore discarded by their rank, not by their likelihood.
 """
 
 from __future__ import annotations
@@ -59,45 +59,51 @@ from pkmcal.outcome.hypotheses import (
 from pkmcal.wording import how_often, listed
 
 SEARCH_OPTIONS = HypothesisOptions(beam=math.inf, most=3)
-"""Of hypotheses whose likelihood a search bounds from below: the likeliest three go on."""
+"""Selection of hypotheses whose likelihood is known by a lower bound only: the likeliest three."""
 OTHER_EXPLANATIONS = 4
-"""Explanations of images beside those of the readings: shifted, under other names, mirrored,
-diameters for radii."""
+"""Number of explanations of images other than mistakes in the readings: shifted, under other names,
+mirrored, diameters for radii."""
 NEAR_SEARCH_TURN = np.radians(15.0)
-"""Turn from the pose by hand beyond which hypotheses are searched about that pose, too."""
+"""Rotation (rad) between localized and rough pose above which hypotheses are searched about the
+rough pose too."""
 OTHER_POSE_TURN = np.radians(45.0)
-"""Turn from the pose by hand beyond which the localized pose contradicts it: a machine of three or
-six equal parts looks the same from there."""
+"""Rotation (rad) between localized and rough pose above which the two contradict each other: a
+machine of three or six equal parts looks the same from both."""
 NAMING_ROUNDS = 3
-"""Rounds of names for images, and of the pose by these names."""
+"""Alternations of the names of images, or the constant of a motor, and the camera's pose."""
 CONSTANTS_COMPARED = 17
-"""Constants of a motor found to be reversed, at a quarter of the spacing of those searched."""
+"""Number of constants of a reversed motor that are compared, at a quarter of the spacing of the
+hypotheses."""
 FEW_CONFIGURATIONS = 4
-"""Images in which all hypotheses about the readings are compared first."""
+"""Number of images in which all hypotheses about the readings are compared first."""
 ENOUGH_IMAGES_ALONE, USUAL_IMAGES = 4, 15
-"""Images below which a message names their number as the reason, because they have no two halves,
-for search and confirmation; and the usual number of images."""
+"""Number of images below which a message gives their number as the reason, because they cannot be
+divided into halves for search and test; and the usual number of images."""
 NUMBERING = "readings.numbering_"
-"""Prefix of the codes of legs that are numbered from another leg, or backwards."""
+"""Prefix of the codes of hypotheses about the numbering of the legs."""
 STATION_PAIRS_SEARCHED = 15
-"""Pairs of stations at most that are searched for each other's pose: all pairs of six stations."""
+"""Largest number of pairs of stations that are searched for exchanged poses: those of six
+stations."""
 
 
 @dataclass(frozen=True)
 class ImageEvidenceOptions:
-    """Evidence that the likelihood of images lacks, which no level of false alarms determines."""
+    """Prior evidence on images, and margins of the likelihood, that no false-alarm level
+    determines.
+    """
 
-    # log-likelihood ratio (nats) of a pose by hand against readings that place the camera on
-    # another side of the machine: more than that of any images, for a person knows the side, and a
-    # machine of equal parts looks the same from each. The refusal names the pose as a rival
+    # log-likelihood ratio (nats) of a rough pose against readings that place the camera on another
+    # side of the machine: more than that of any images, because a person does not mistake the
+    # side, and a machine of equal parts looks the same from each. The refusal names the pose as a
+    # rival
     pose_by_hand: float = 1000.0
-    # share of the mean log-likelihood ratio of a localized machine's images by which another name
-    # has to be likelier, another numbering of its legs, or any mistake if a second search localizes
-    # the machine as stated: between two nearly equal configurations,
-    # and between equal parts of a machine, errors of the nominal model decide, of which the
-    # likelihood contains the scatter but not that all images of a station share them. Their effect
-    # grows with the evidence, so it is a share and no number of nats. On simulated machines,
-    # exchanged names had 0.2 to 2 times as much, right names up to 0.03
+    # margin, as a share of the mean log-likelihood ratio of a station's images, by which a mistake
+    # has to be likelier: another name of an image, another numbering of the legs, or any mistake
+    # where the machine was not localized as stated. Between nearly equal configurations, equal
+    # parts of a machine, or a machine and its mirror image from the opposite side, errors of the
+    # nominal model decide. The likelihood contains their scatter, but not their correlation over
+    # the images of a station. Their effect is proportional to the evidence, hence a share. On
+    # simulated machines wrong names had ratios of 0.2 to 2, right names up to 0.03
     right_name_share: float = 0.1
 
 
@@ -107,9 +113,12 @@ IMAGE_EVIDENCE = ImageEvidenceOptions()
 class SuspectStation(NamedTuple):
     """Station whose images are compared with hypotheses.
 
-    name, files : of the station and its images. configurations : names in the session. table,
-    columns : file of the readings and its columns. by_hand : T_camera_base (4, 4), None without a
-    pose by hand.
+    name, files : of the station and of its images.
+    configurations : names of the images' configurations.
+    table, columns : file of the readings, and its columns.
+    view : images and machine as stated.
+    by_hand : rough pose T_camera_base (4, 4), None without one.
+    localization : result for the session as stated.
     """
 
     name: str
@@ -123,12 +132,12 @@ class SuspectStation(NamedTuple):
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the machine was localized far from the pose by hand, or not at all."""
+        """Whether the machine was localized far from the rough pose, or not at all."""
         return not self.localization.good or self.turned > OTHER_POSE_TURN
 
     @property
     def turned(self) -> float:
-        """Turn (rad) of the localized pose from the one by hand; 0 without one."""
+        """Rotation (rad) between the localized and the rough pose; 0 without a rough pose."""
         if self.by_hand is None:
             return 0.0
         return float(angle_between(self.localization.T_camera_base, self.by_hand))
@@ -141,7 +150,8 @@ StationPair = tuple[SuspectStation, SuspectStation]
 class ImageHypothesis(Hypothesis[StationView]):
     """Hypothesis about the images of a station; its data are the station's view.
 
-    error : names the mistake. readings : (K, m) of the images, where nothing else differs.
+    error : error that names the mistake.
+    readings : (K, m) of the images, for a hypothesis that changes nothing else.
     """
 
     error: InputError = field(default_factory=lambda: InputError(""))
@@ -154,10 +164,12 @@ def mistake(
     options: ImageEvidenceOptions = IMAGE_EVIDENCE,
 ) -> InputError | None:
     """Error about stations whose images disagree with the session, None if all agree."""
+    # exchanged stations
     error = _swapped_stations([s for s in stations if s.elsewhere], rng)
     if error is not None or not stations:
         return error
     bad = [station for station in stations if not station.localization.good]
+    # the station with the least evidence decides about the readings
     worst = max(
         stations, key=lambda s: (not s.localization.good, s.elsewhere, s.localization.p_value)
     )
@@ -170,6 +182,7 @@ def mistake(
         rest = (station for station in stations if station is not worst)
         errors = (_likelier(s, list(_other_images(s, options)), True, rng, options) for s in rest)
         return next((error for error in errors if error is not None), None)
+    # no hypothesis explains the images
     others = [station.name for station in bad if station is not worst]
     at = ", nor in those of " + listed(others) if others else ""
     few = len(worst.view.configuration) < ENOUGH_IMAGES_ALONE
@@ -192,7 +205,7 @@ def mistake(
 
 
 def _little(station: SuspectStation) -> str:
-    """Description of the evidence, which is too weak."""
+    """Reason why the evidence for the machine is too weak, in words."""
     localization = station.localization
     if localization.p_value < localization.limit:
         return "legs that fit nearly as well at another place"
@@ -207,10 +220,11 @@ def _little(station: SuspectStation) -> str:
 def _swapped_stations(
     stations: list[SuspectStation], rng: np.random.Generator
 ) -> InputError | None:
-    """Error about two stations whose images are exchanged, rather than mirrored: the mirror image
-    of a symmetric machine resembles the machine from the other side.
+    """Error about two stations whose images are exchanged.
 
-    stations : localized far from their poses by hand, or not at all.
+    Mirrored images are the rival hypothesis, because the mirror image of a symmetric machine
+    resembles
+    the machine from the other side. stations : localized far from their rough poses, or not at all.
     """
     placed = [station for station in stations if station.by_hand is not None]
 
@@ -229,7 +243,8 @@ def _swapped_stations(
             for s in hypothesis.apply(pair):
                 at = find_station(s.view, s.by_hand, rng, near_prior=True)
                 if s._replace(localization=at).elsewhere:
-                    out[k:] = -np.inf  # mirrored images matter beside exchanged ones alone
+                    # without exchanged stations there is no need to exclude mirrored images
+                    out[k:] = -np.inf
                     return out
                 out[k] += at.log_likelihood_ratio / at.correlation_length
         return out
@@ -240,6 +255,7 @@ def _swapped_stations(
             Hypothesis("station.exchanged", subject, exchanged),
             Hypothesis("image.mirrored", subject, mirrored),
         ]
+        # both machines have to be localized near the exchanged poses
         level = EvidenceLevel("near search", partial(by_near_search, (one, other)))
         best = decide(posterior(hypotheses, [level], SEARCH_OPTIONS))
         if best is not None and best.hypothesis.code == "station.exchanged":
@@ -262,9 +278,10 @@ def _mixed_up(
 ) -> InputError | None:
     """Error of the hypothesis that explains a station's images better than the session, if any.
 
-    in_order : whether another station shows that the readings are in order.
+    in_order : whether another station confirms the readings.
     """
     view, localization = station.view, station.localization
+    # poses from which the hypotheses are searched: the localized one, and the rough one
     starts = (
         [localization.T_camera_base] if localization.good or station.by_hand is not None else []
     )
@@ -288,18 +305,20 @@ def _mixed_up(
                 joints = other.joints[None]
                 values[k] = likelihood_nearby(other, joints, begin, wide, images, rng)[0]
             values = (values - own) / localization.correlation_length
-            # at a confirmed pose another explanation has to be better at once
+            # at a confirmed pose, only explanations that are better at this level are retained
             return values if station.elsewhere else np.where(values > 0, values, -np.inf)
 
         return EvidenceLevel(
             f"{len(images)} images", ratios, decides=False, most=SEARCH_OPTIONS.most
         )
 
+    # few images, then all images
     levels = [searched(view.few(FEW_CONFIGURATIONS))]
     if not station.elsewhere:
-        # of few images any other explanation may fit better by chance
+        # in a few images another explanation may fit better by chance
         levels.append(searched(view.few(len(view.configuration))))
     hypotheses, others = list(_hypotheses(station)), list(_other_images(station, options))
+    # full search for the likeliest
     some = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
     count = len({one.meaning for one in (*hypotheses, *others)})
     return _likelier(station, [*others, *some], in_order, rng, options, count)
@@ -313,13 +332,16 @@ def _likelier(
     options: ImageEvidenceOptions,
     count: int | None = None,
 ) -> InputError | None:
-    """Error of the likeliest hypothesis, by a full search, that explains a station better than the
-    session, if any, with the rivals that it does not exclude.
+    """Error of the likeliest hypothesis that explains a station better than the session, by a full
+    search.
 
-    count : number of explanations of which these are the likeliest; of these, if None. Chance may
-    confirm any of them, so the p-value of each is multiplied by their number (Bonferroni). The
-    constants of a reversed motor are one explanation, as in the prior odds: those near each other
-    show nearly the same legs.
+    The error names the rival hypotheses that the images do not exclude. None if no hypothesis is
+    better.
+
+    count : number of explanations from which ``hypotheses`` were selected, by default their own
+        number. Any of them may be confirmed by chance, so p-values are multiplied by it
+        (Bonferroni). All constants of a reversed motor are one explanation, as in the prior odds,
+        because neighbouring ones predict nearly the same legs.
     """
     if not hypotheses:
         return None
@@ -333,8 +355,9 @@ def _likelier(
         )
         poses = np.stack([f.T_camera_base for f in (localization, own, *searched)])
         stated = likelihood_from(view, poses)
-        # a machine that only this search localizes was missed, rather than described wrongly
-        missed = own.good and not localization.good
+        # a machine that was not localized may have been missed, rather than described wrongly, and
+        # its mirror image fits from the opposite side as well as errors of the nominal model allow
+        missed = not localization.good
         margin = options.right_name_share * own.log_likelihood_ratio if missed else 0.0
         out = np.full(len(hypotheses), -np.inf)
         for k, (h, other, at) in enumerate(zip(hypotheses, views, searched, strict=True)):
@@ -342,8 +365,7 @@ def _likelier(
                 continue
             gain = likelihood_from(other, poses) - stated - margin
             ratio = gain / localization.correlation_length
-            # the stated readings contradict the pose by hand, and no other station shows that they
-            # are in order
+            # the stated readings contradict the rough pose, and no other station confirms them
             if station.elsewhere and localization.good and not in_order and h.readings is not None:
                 out[k] = ratio + options.pose_by_hand
             elif at.p_value * count < at.limit:
@@ -351,17 +373,19 @@ def _likelier(
         return out
 
     level = EvidenceLevel("full search", by_full_search)
+    # hypotheses that are likelier than the session
     found = likely(posterior(hypotheses, [level], SEARCH_OPTIONS))
     if not found:
         return None
     if _any_numbering(station):
-        # another numbering alone explains the images no better, since the camera may stand
-        # anywhere, but it may explain as well what seems to be another mistake
+        # Without a rough pose another numbering is as likely as the stated one, so it is no mistake
+        # by itself, but it may be a rival of the mistake that was detected.
         numberings = list(_numberings(station, options))
         count += len(numberings)
         equal = posterior(numberings, [_searched_anywhere(station, rng)], SEARCH_OPTIONS)
         some = [one.hypothesis for one in (*found, *equal)]
         found = likely(posterior(some, [level], SEARCH_OPTIONS)) or found
+    # error of the likeliest, with its rivals
     errors = [one.hypothesis.error for one in found]
     if errors[0].code == "readings.reversed":
         errors[0] = _with_likeliest_constant(station, found[0].hypothesis, rng)
@@ -381,16 +405,17 @@ def _likelier(
 def _with_likeliest_constant(
     station: SuspectStation, hypothesis: ImageHypothesis, rng: np.random.Generator
 ) -> InputError:
-    """Error about a reversed motor, with the constant near the hypothesis's own at which the robust
-    fit of the edges is best; the camera's pose is estimated for each.
+    """Error about a reversed motor, with the constant at which the robust fit of the edges is best.
+
+    Constants near that of the hypothesis are compared; the camera's pose is estimated for each.
     """
     view, constant = station.view, hypothesis.facts["constant"]
     (motor,) = hypothesis.facts["motors"]
     low, high = view.machine.joint_ranges[motor]
     spacing = (high - low) / READING_HYPOTHESIS_OPTIONS.constants_in_a_stroke
     every = view.few(len(view.configuration))
-    # the likelihood has local maxima 20 mm of a constant apart, and has chosen among them; the
-    # truncated distances of the last descent have one minimum for each start
+    # The likelihood has local maxima 20 mm of the constant apart, of which the hypothesis is the
+    # highest. The truncated distances of the last descent have a single minimum around it.
     reaches = LOCALIZATION_OPTIONS.reaches + LOCALIZATION_OPTIONS.final_reaches
     for _ in range(NAMING_ROUNDS):  # the constant determines the pose, and the pose the constant
         turned = reversed_motor(motor, constant).apply(view.all_joints)
@@ -414,7 +439,9 @@ def _reading_error(station: SuspectStation, hypothesis: ReadingHypothesis) -> In
 def _searched_anywhere(
     station: SuspectStation, rng: np.random.Generator
 ) -> EvidenceLevel[ImageHypothesis]:
-    """Evidence for other readings by a short search in few images, wherever the camera stands."""
+    """Level of evidence for other readings: a short search in few images, without a prior of the
+    pose.
+    """
     view = station.view
     few, anywhere = view.few(FEW_CONFIGURATIONS), np.zeros((0, 4, 4))
 
@@ -428,17 +455,18 @@ def _searched_anywhere(
 
 
 def log_prior_of_each(machine: Machine, joints: Array) -> float:
-    """Prior log-odds of each explanation of images, all alike. joints : readings (K, m)."""
+    """Log prior odds of each explanation of images, equal for all. joints : readings (K, m)."""
     readings = reading_hypotheses(joints, machine.joint_ranges)
     return -math.log(len({h.meaning for h in readings}) + OTHER_EXPLANATIONS)
 
 
 def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
-    """Hypotheses about the readings and about images under their neighbours' names; of a station
+    """Hypotheses about the readings, and about images under their neighbours' names; for a station
     that was not localized, also diameters in place of radii.
     """
     view, prior = station.view, log_prior_of_each(station.view.machine, station.view.all_joints)
-    # images may be of some configurations: their names shift, below
+    # shifted names are tried below, by the station's own images, which may be of some
+    # configurations only
     yield from (
         one
         for one in _of_readings(station)
@@ -457,8 +485,8 @@ def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
                 error=_shifted(step),
                 readings=view.all_joints[shifted],
             )
-    # thin legs of few pixels are as likely to be thinner still, and two images of right ones can
-    # fit so by chance: only where nothing else explains
+    # Legs of a few pixels' width fit almost as well with half the radius, and two images may prefer
+    # it by chance: tried only if the machine was not localized.
     if not station.localization.good and len(names) > 2:
         yield ImageHypothesis(
             "tube.diameter", "tubes", _with_half_radii, prior, error=diameters("mechanism.yaml")
@@ -482,7 +510,9 @@ def _of_readings(station: SuspectStation) -> Iterator[ImageHypothesis]:
 
 
 def _any_numbering(station: SuspectStation) -> bool:
-    """Whether a machine of equal thirds would be localized by any of its equal numberings."""
+    """Whether the numbering of the legs is undetermined: a machine of equal thirds, without a rough
+    pose, is localized with any of its equivalent numberings.
+    """
     return station.localization.good and station.by_hand is None
 
 
@@ -506,8 +536,8 @@ def _with_half_radii(view: StationView) -> StationView:
 def _other_images(
     station: SuspectStation, options: ImageEvidenceOptions
 ) -> Iterator[ImageHypothesis]:
-    """Images under the names that fit each of them best; mirrored images where the machine was not
-    localized near its pose by hand.
+    """Hypotheses about images under other names; where the machine was not localized near its rough
+    pose, also about mirrored images.
     """
     view, T_camera_base = station.view, station.localization.T_camera_base
     names, prior = view.configuration, log_prior_of_each(view.machine, view.all_joints)
@@ -522,8 +552,8 @@ def _other_images(
     if not 2 < len(names) == len(np.unique(names)):
         return
     columns = np.arange(len(names))
-    # each image could have any name, and at least two images have wrong names; without this prior,
-    # images of equal configurations would exchange their names
+    # prior of the stated names: each image could have any name, and at least two have to be wrong;
+    # without it, images of equal configurations would exchange their names
     choices, own = math.log(len(names)), station.localization
     keep_evidence = (
         own.log_likelihood_ratio / (own.correlation_length * len(names)) if own.good else 0.0
@@ -553,8 +583,8 @@ def _best_names(score: Array) -> Integers:
     """Assignment (n,) of names to images, each used once, with the largest sum of scores (n, n)."""
     others = np.where(np.eye(len(score), dtype=bool), -np.inf, score).max(axis=1)
     gain = np.sort(others - np.diag(score))
-    # at least two images have to change their names; where that loses, as it usually does, SciPy's
-    # assignment, which is slow to import, is not needed
+    # usually even the best two changes of names lower the sum: the stated names are then best, and
+    # SciPy's assignment, which is slow to import, is not needed
     if gain[-2:].sum() < 0:
         return np.arange(len(score))
     from scipy.optimize import linear_sum_assignment

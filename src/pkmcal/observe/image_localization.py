@@ -1,16 +1,17 @@
 """Camera localization from a single image without a prior.
 
-Camera positions all round the machine, at distances at which it fills the image or a third of it,
-rotations about the optical axis and positions in the image are scored by the middles of the tubes
-on a chart of possible tubes (:mod:`pkmcal.observe.tubes`). The best few thousand descend as in the
-localization of a station (:mod:`pkmcal.observe.pose_likelihood`), on tables with three times as
-many edge directions. The best of these are refined on tables of twice and four times the
-resolution, where texture contributes much less log likelihood and the machine more.
+Coarse poses: camera directions all round the machine, distances at which it fills a third of the
+image to more than all of it, rotations about the optical axis, and positions in the image. They are
+scored by the centres of the tubes on a chart of possible tubes (:mod:`pkmcal.observe.tubes`). The
+best few thousand descend as in the localization of a station
+(:mod:`pkmcal.observe.pose_likelihood`), on tables with three times as many edge directions. The
+best of these are refined on tables of twice and four times the resolution, where texture
+contributes much less log likelihood and the machine more.
 
-The second best hypothesis measures the certainty of the best: clutter rarely produces a single
-match, and a machine of equal parts looks nearly the same from several sides. An error of the
-nominal model moves all edges of a leg together, so in this comparison each half of a leg counts as
-one measurement.
+The log-likelihood ratio to the second best hypothesis measures the certainty of the best: clutter
+rarely produces a single match, and a machine of equal parts looks nearly the same from several
+sides. An error of the nominal model moves all edges of a leg together, so in this comparison each
+half of a leg counts as one measurement.
 """
 
 from __future__ import annotations
@@ -418,7 +419,7 @@ def _border(surprisal: Integers) -> int:
 
 
 def _scores(
-    visibility: Array,
+    points: Array,
     radius: Array,
     turn: float,
     chart: TubeChart,
@@ -428,16 +429,16 @@ def _scores(
     """Mean map value (P, shifts) at the middles of the tubes, weighted by their length in the
     image.
 
-    visibility : (P, T, 3, 3) first, middle and last points of the tubes in the camera frames of P
+    points : (P, T, 3, 3) first, middle and last points of the tubes in the camera frames of P
         positions.
     radius : (T,) m.
     turn : rotation about the optical axis, rad.
     windows : as :func:`_windows` returns them.
     """
     # chart coordinates of the points: angle from the optical axis, rotated by the turn
-    beside = np.hypot(visibility[..., 0], visibility[..., 1])
-    angle = np.arctan2(beside, visibility[..., 2])
-    cell = visibility[..., :2] * (chart.scale * angle / np.maximum(beside, 1e-12))[..., None]
+    beside = np.hypot(points[..., 0], points[..., 1])
+    angle = np.arctan2(beside, points[..., 2])
+    cell = points[..., :2] * (chart.scale * angle / np.maximum(beside, 1e-12))[..., None]
     cell = cell @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     # direction, apparent width and weight of each tube
     chord = cell[:, :, 2] - cell[:, :, 0]
@@ -446,7 +447,7 @@ def _scores(
         np.rint(normal % np.pi * (chart.options.directions / np.pi)).astype(np.intp)
         % chart.options.directions
     )
-    width = 2 * radius * chart.scale / np.sqrt(dot(visibility[:, :, 1], visibility[:, :, 1]))
+    width = 2 * radius * chart.scale / np.sqrt(dot(points[:, :, 1], points[:, :, 1]))
     weight = np.hypot(chord[..., 0], chord[..., 1])
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
     # first cell of each tube's window of shifts
@@ -455,8 +456,8 @@ def _scores(
     first = _border(chart.surprisal) - options.stride * (np.array(shifts[::-1]) // 2)
     at = np.clip(at + first, 0, np.array(windows.shape[3:1:-1]) - 1)
     which = chart.width_number(width)
-    out = np.empty((len(visibility), shifts[0] * shifts[1]), dtype=np.float32)
-    for k in range(0, len(visibility), options.batch):
+    out = np.empty((len(points), shifts[0] * shifts[1]), dtype=np.float32)
+    for k in range(0, len(points), options.batch):
         part = slice(k, k + options.batch)
         worth = windows[which[part], number[part], at[part, :, 1], at[part, :, 0]]
         worth = worth.reshape(*worth.shape[:2], -1).astype(np.float32)

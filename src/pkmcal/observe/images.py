@@ -1,11 +1,11 @@
-"""Images from disk as grey levels, decoded by Pillow; broken files are named with their fault.
+"""Images from disk as grey levels, decoded by Pillow; errors name broken files and their fault.
 
-Pillow and not OpenCV decodes: the levels are the same, but the decoders behind OpenCV report
-faults on standard error instead of to their caller, and OpenCV reads no HEIF.
+Pillow decodes, not OpenCV: the levels are the same, but the decoders behind OpenCV report faults on
+standard error instead of to their caller, and OpenCV reads no HEIF.
 
-Six thousand images do not fit into memory, and an ordinary session's should not be decoded in each
-measurement pass. So the first that fit into CACHED_IMAGE_BYTES bytes are kept, and the others are
-decoded each time they are needed. Code that needs many works in windows
+Six thousand images do not fit into memory, but those of an ordinary session should be decoded once,
+not in each measurement pass. So the first images that fit into CACHED_IMAGE_BYTES bytes are cached,
+and the others are decoded each time they are needed. Code that needs many images works in windows
 (`pkmcal.observe.image_batches`).
 """
 
@@ -29,28 +29,30 @@ if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
 
 CACHED_IMAGE_BYTES = 128 * 2**20
-"""Bytes of decoded images that are kept: 160 of 1024x768, 10 of a telephone's."""
+"""Size of the cache of decoded images: 160 of 1024x768 pixels, 10 of a telephone's."""
 CAMERA_BIT_DEPTHS, UNSHIFTED_GREY_LEVEL = (8, 10, 12), 15
-"""Bit depths of cameras whose levels programs store in 16 bits without a shift, and the highest of
-256 grey levels that is left of them then."""
+"""Bit depths of cameras whose levels some programs store in 16 bits without a shift, and the
+highest grey level, of 256, of such an image with 12 bits."""
 JPEG_MARKER = re.compile(rb"\xff+[\x01-\xfe]")
-"""A marker in a JPEG file's image data: behind a byte 255 of the data themselves stands 0."""
+"""A marker in a JPEG file's image data; in the data themselves a byte 255 is followed by 0."""
 MISSING_LEVEL = 128
-"""Grey level of the blocks that a sequential JPEG file's data do not reach."""
+"""Grey level to which decoders set missing blocks of a sequential JPEG file."""
 MORE_SCAN_DATA = bytes(range(1, 255))
-"""Bytes that a JPEG decoder takes for more of an unfinished scan."""
+"""Bytes that a JPEG decoder reads as the continuation of an unfinished scan."""
 UPRIGHT_TURNS = {3: 2, 6: 1, 8: 3}
-"""Quarter turns clockwise that make an image of an EXIF orientation upright."""
+"""Number of clockwise quarter turns that make an image upright, by its EXIF orientation."""
 
 
 def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
     """Grey levels (height, width), uint8, of one image file, as the sensor has them.
 
-    image_size : (width, height) that the camera file states. An image with the two exchanged was
-    turned by a quarter after it was taken, or its camera was calibrated from turned images: it is
-    turned as EXIF asks viewers to, and without EXIF as a telephone's that is held upright:
-    landscape clockwise, portrait the other way.
-    Raises InputError for a file that is absent, cut short, no image, or of another size.
+    image_size : (width, height) in the camera file. An image with the two exchanged was rotated by
+        a quarter turn after it was taken, or its camera was calibrated from rotated images. It is
+        rotated by its EXIF orientation; without EXIF, landscape images clockwise and portrait
+        images anticlockwise, as if from an upright telephone.
+    label : name of the file in messages.
+
+    Raises InputError for a file that is absent, truncated, not an image, or of another size.
     """
     try:
         check_regular(path, label)
@@ -76,9 +78,9 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
 
 
 def upright_turns(path: Path, image_size: tuple[int, int]) -> int:
-    """Quarter turns clockwise by which EXIF asks viewers to turn the image of :func:`decode`.
+    """Number of clockwise quarter turns that make the image of :func:`decode` upright, by EXIF.
 
-    0 for an image that was turned when decoded, and for a file that cannot be read.
+    0 for an image that was rotated when decoded, and for a file that cannot be read.
     """
     try:
         with path.open("rb") as stream:
@@ -94,7 +96,7 @@ def _checked_grey(data: bytes, image: ImageFile, label: str) -> Integers:
     kind = image.format
     try:
         if kind == "PNG":
-            image.verify()  # the checksums of its chunks, which decoding does not read
+            image.verify()  # checksums of the chunks, which decoding does not check
             image = open_image(BytesIO(data), label)
         sixteen_bits = ";16" in str(image.tile[:1])  # Pillow's raw modes I;16B, RGB;16N, ...
         grey = _grey(image)
@@ -133,10 +135,10 @@ def _grey(image: ImageFile) -> Integers:
 
 
 def _scan_is_whole(data: bytes, grey: Integers, label: str) -> bool:
-    """Whether a JPEG file's image data reach its last pixel.
+    """Whether a JPEG file's image data are complete.
 
-    At the next marker decoders fill what is missing, and do not report it. Bytes put before the
-    marker are skipped where the data are complete, and decoded to pixels where they are not.
+    Decoders fill missing data up to the next marker without a report. So bytes are inserted before
+    the marker: they are skipped if the data are complete, and change pixels if not.
     """
     stream = BytesIO(data)
     image = open_image(stream, label)  # which stops behind the header of the first scan
@@ -158,8 +160,8 @@ def _undecodable(label: str, found: str) -> InputError:
 
 
 def _too_dark(label: str, highest: int) -> InputError:
-    """The error about a 16-bit file whose levels fill only its lowest bits: of the 8 bits that
-    pkmcal works with, next to nothing is left.
+    """Error about a 16-bit file whose levels use only its lowest bits, which the conversion to 8
+    bits discards.
     """
     bits = next(bits for bits in CAMERA_BIT_DEPTHS if highest < 2**bits)
     return InputError(
@@ -206,8 +208,8 @@ class Selected(LazyPictures):
 class Pictures(LazyPictures):
     """Images of one camera, each decoded on first use.
 
-    paths, labels : of all of them.
-    cache : those that stay decoded, by their number.
+    paths, labels : of all images.
+    cache : decoded images that remain in memory, by number.
     """
 
     def __init__(
@@ -224,9 +226,9 @@ class Pictures(LazyPictures):
     def read(
         cls, paths: Sequence[Path], image_size: tuple[int, int], labels: Sequence[str], most: int
     ) -> Pictures:
-        """Decode each image once, on a few threads, and keep the first ``most``.
+        """Decode each image once, on a few threads, and cache the first ``most``.
 
-        Raises InputError for the first that cannot be decoded.
+        Raises InputError for the first image that cannot be decoded.
         """
         out = cls(paths, image_size, labels)
 
@@ -250,7 +252,7 @@ class Pictures(LazyPictures):
 
 
 def fitting(image_size: tuple[int, int], room: int) -> int:
-    """Number of decoded images that fit into so many bytes."""
+    """Number of decoded images that fit into ``room`` bytes."""
     return room // (image_size[0] * image_size[1])
 
 

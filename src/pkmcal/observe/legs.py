@@ -469,6 +469,7 @@ def measure_stations(
     passes: list[StationEdges] = []
     shifted: list[Array] = [np.zeros(0)]
     for window in windows(placed):
+        # edges window by window; a station's first window may determine its blur
         prediction = _predicted_edges(window, machine, options)
         new = [k for k in np.unique(window.station).tolist() if k not in numbers]
         numbers |= _blur_in(prediction.across, new, options.profiles)
@@ -479,6 +480,7 @@ def measure_stations(
             done(len(window.images))
         del prediction, window  # free before the next one is decoded
     every = joined_passes(passes, float("nan"), float("nan"))
+    # edges of each station, with its blur and median shift
     away, at = np.concatenate(shifted), every.edges.station[every.point_edge]
     out: list[StationEdges] = []
     for one in placed:

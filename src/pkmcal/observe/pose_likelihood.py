@@ -18,7 +18,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import cross, of_components, perturb, pose, rotation
+from pkmcal.geometry.rigid import cross, dot, of_components, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.distance_tables import DISTANCE_TABLE_OPTIONS, DistanceTables
 from pkmcal.observe.predict import (
@@ -64,6 +64,9 @@ class LikelihoodOptions:
     # steps of expectation maximization of a mixture that is used afterwards; within a descent
     # three suffice, for the poses change too
     mixture_rounds: int = 10
+    # angle within which two predicted edges have the same direction: they match the same edges in
+    # the distance tables
+    same_direction: float = np.pi / DISTANCE_TABLE_OPTIONS.directions
     # longest step of a pose, rad and m: the tables' slopes are valid nearby only
     longest_step: float = 0.1
 
@@ -416,7 +419,8 @@ def refine_ml(
     start = first_mixture(len(candidates), view.options)
     rounds = view.options.mixture_rounds
     mixture = linearization.distances.mixture(start, rounds, widest, view.options)
-    return candidates, _summed(linearization.distances.log_likelihood(mixture))
+    each = linearization.distances.log_likelihood(mixture)
+    return candidates, _summed(each / coinciding_edges(view, candidates, images, samples))
 
 
 def first_mixture(count: int, options: LikelihoodOptions = LIKELIHOOD_OPTIONS) -> _Mixture:
@@ -518,6 +522,32 @@ def distances_under(
     points, direction, number = _edges_under(view, candidates, images, samples)
     distance, inside = view.tables.look_up(direction, points.pixel, number, between=True)
     return _distances(view, points, direction, distance, inside & points.valid)
+
+
+def coinciding_edges(view: StationView, candidates: Array, images: Integers, samples: int) -> Array:
+    """Number of predicted edges that coincide at each point (H, E, n), its own included.
+
+    Edges coincide on the same side of their legs, in the same direction, where the scatter of
+    silhouettes does not separate them. All of them match the same image edge, which is evidence for
+    one leg only. Otherwise a pose from which two legs lie behind each other would fit better than
+    the correct one.
+    """
+    parts = _parts(view, len(candidates), len(images) * samples * 2 * len(view.tubes))
+    if len(parts) > 1:
+        return np.concatenate(
+            [coinciding_edges(view.guess(k), candidates[k], images, samples) for k in parts]
+        )
+    points, _, _ = _edges_under(view, candidates, images, samples)
+    pixel, outward = points.pixel[..., None, :], points.outward[..., None, :]  # (H, K, E, n, 1, 2)
+    begin, middle = points.pixel[..., 0, :], points.outward[..., points.outward.shape[-2] // 2, :]
+    chord = points.pixel[..., -1, :] - begin
+    begin, chord, normal = (v[..., None, None, :, :] for v in (begin, chord, middle))
+    along = dot(pixel - begin, chord) / np.maximum(dot(chord, chord), 1e-9)
+    across = np.abs(dot(pixel - begin, normal))
+    beside = (along >= 0) & (along <= 1) & (across < view.options.apart * view.tables.scale)
+    coincides = beside & (dot(outward, normal) > np.cos(view.options.same_direction))
+    count = np.maximum(coincides.sum(axis=-1), 1)
+    return count.reshape(len(candidates), -1, samples).astype(np.float32)
 
 
 def linearize_distances(

@@ -3,9 +3,9 @@
 Legs that move in a plane cast shadows on a parallel plane that have exactly the machine's shape,
 often with clearer edges than the machine itself. A shadow always darkens the surface. So of two
 poses with similar orientation, one on pixels that have become darker and the other on pixels that
-have become brighter than in the other images, the darker one is the shadow of the other: brighter
-pixels could not be explained by a machine at the darker pose. Nothing follows for machines that are
-darker than their background.
+have become brighter than in the other images, the darker one is the shadow of the other: a machine
+at the darker pose would not explain the brighter pixels. A machine that is darker than its
+background allows no such conclusion.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ def lightness(
 def without_shadows(
     places: Array, light: Array, options: ShadowOptions = SHADOW_OPTIONS
 ) -> Integers:
-    """Indices of the pose candidates (H, 4, 4) that are not another one's shadow.
+    """Indices of the pose candidates (H, 4, 4) that are not the shadow of another candidate.
 
-    light : (H,) as `lightness` returns. A shadow's candidate is turned little against the
-    machine's, for the two planes are nearly parallel.
+    light : (H,) as `lightness` returns. A shadow has nearly the machine's orientation, because the
+        two planes are nearly parallel.
     """
     casts = (light > options.changed) & same_pose(places[:, None], places)
     return np.flatnonzero((light > -options.changed) | ~casts.any(axis=1))

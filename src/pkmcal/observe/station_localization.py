@@ -320,7 +320,14 @@ def _search(
         candidates = _random_search(view, prior, rng, options)
     # robust refinement, then the best on more images
     candidates = refine_lm(view, candidates, few, 5, options.reaches)
-    candidates = _best(view, candidates, more, reach=5, keep=options.retained)
+    if prior is None:
+        # most are the same as a better one, and by their distances alone the correct pose is
+        # often not among the best ten: distinct ones, which the likelihood then compares
+        candidates = _best(view, candidates, more, reach=5, keep=len(candidates))
+        distinct = distinct_silhouettes(view, candidates, more)[: options.retained]
+        candidates = candidates[distinct]
+    else:
+        candidates = _best(view, candidates, more, reach=5, keep=options.retained)
     likelier = candidates[: len(candidates) // 2]
     # if all images took part in the refinement, none is left to disagree, unless the prior is
     # narrow
@@ -348,7 +355,8 @@ def _best_about(
     of them.
     """
     candidates = refine_lm(view, candidates, images, 5, options.candidate_reaches)
-    candidates = _best(view, candidates, images, reach=3, keep=options.retained)
+    candidates, log_likelihood_ratio = refine_ml(view, candidates, images, 3, 2)
+    candidates = candidates[np.argsort(-log_likelihood_ratio)]
     candidates = candidates[
         distinct_silhouettes(view, candidates, images)[: options.perturbed_about]
     ]

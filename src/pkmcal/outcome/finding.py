@@ -1,30 +1,26 @@
 """Findings: messages of checks, each a code with facts, and the sentence made from them.
 
 A finding is made where its fact is computed: code, level, subject and facts in SI units. The
-sentence is a template in ``sentences/AREA.toml``, AREA being the first part of the code; programs,
-tests and benchmarks read codes and facts. Templates have the fields of :meth:`str.format` and
-these formats in addition:
+sentence is a template in ``sentences/AREA.toml``, with AREA the first part of the code; programs,
+tests and benchmarks read codes and facts. Templates have the fields of :meth:`str.format` and these
+formats in addition:
 
 =======================  =====================================================================
-``{x:.2g mm}``           a number in m or rad, in another unit
-``{x:amount m}``         the magnitude of a number in m or rad, two digits, in mm or degrees
-``{x+unit:amount}``      the same for a number with its unit
-``{x:brief}``            a number with two significant digits or more, without an exponent
-``{x+s:ratio}``          the magnitude of a ratio and its standard deviation, in per cent
-``{x+units:either .2g}`` noise of readings that are lengths (m), angles (rad) or both
-``{x:range}``            ``0.5 to 2``, or ``more than 0.5`` if the second number is None
-``{x:size .1%}``         the magnitude of a number, in the format that follows
-``{x:count edge}``       ``1 edge``, ``12 edges``
-``{x:listed 4}``         names, of many the first; ``joined``: all of them
-``{x:one is|are}``       the first word for 1, or for a list of one
-``{x:sign more|less}``   the first word for a positive number
-``{x:case a=this|b=}``   by the value of a text
-``{x:often}``            a probability, as ``once in 30 times``
-``{x:capital}``          the beginning of a sentence
+``{x:.2g mm}``           a number in m or rad, in another unit ``{x:amount m}``         the
+magnitude of a number in m or rad, two digits, in mm or degrees ``{x+unit:amount}``      the same
+for a number with its unit ``{x:brief}``            a number with two significant digits or more,
+without an exponent ``{x+s:ratio}``          the magnitude of a ratio and its standard deviation, in
+per cent ``{x+units:either .2g}`` noise of readings that are lengths (m), angles (rad) or both
+``{x:range}``            ``0.5 to 2``, or ``more than 0.5`` if the second number is None ``{x:size
+.1%}``         the magnitude of a number, in the format that follows ``{x:count edge}``       ``1
+edge``, ``12 edges`` ``{x:listed 4}``         names, of many the first; ``joined``: all of them
+``{x:one is|are}``       the first word for 1, or for a list of one ``{x:sign more|less}``   the
+first word for a positive number ``{x:case a=this|b=}``   by the value of a text ``{x:often}``
+a probability, as ``once in 30 times`` ``{x:capital}``          the beginning of a sentence
 =======================  =====================================================================
 
-A part in ``[[ ]]`` is left out if one of its facts is missing or None; text after ``||`` in the
-part then takes its place.
+A part in ``[[ ]]`` is omitted if one of its facts is missing or None, and replaced by the text
+after ``||`` in the part, if there is one.
 """
 
 from __future__ import annotations
@@ -76,7 +72,8 @@ class Finding:
     code : ``area.what``, such as readings.scale.
     level : severity.
     facts : numbers in SI units, texts, and lists of these, by name. Common names: value, sigma,
-        log_odds, tool_shift (m) and tool_shift_sigmas.
+        log_odds, tool_shift (m), tool_shift_sigmas, and rivals, other explanations that the data do
+        not exclude.
     subject : file, leg, column, station or configuration concerned.
     error : the error that the finding reports, if any.
     saved_text, saved_next_step : sentences of a finding that was read from a file, in the wording
@@ -128,7 +125,10 @@ class Finding:
             return self.saved_text, self.saved_next_step
         template = templates(self.code.partition(".")[0])[self.code]
         facts = {"subject": self.subject, **self.facts}
-        return filled(template["text"], facts), filled(template.get("next_step", ""), facts)
+        text = filled(template["text"], facts)
+        if facts.get("rivals"):  # of any model violation
+            text += " " + filled(templates("violation")["violation.rivals"]["text"], facts)
+        return text, filled(template.get("next_step", ""), facts)
 
 
 def finding(code: str, level: Level, subject: str = "", **facts: Any) -> Finding:

@@ -9,9 +9,9 @@ in nats. Levels of evidence, the cheapest first, compute the log-likelihood rati
 hypotheses; the first level that decides ends the comparison. Each level uses the effective sample
 size: correlated residuals count once.
 
-A likelihood ratio compares explanations; none of them may be tenable. Whether the machine is in the
-images at all, and whether the residuals of a hypothesis are as small as their noise, are absolute
-tests: a level returns minus infinity for hypotheses that fail them.
+A likelihood ratio compares explanations, none of which may be tenable. So there are absolute tests
+too: whether the machine is in the images at all, and whether the residuals of a hypothesis are as
+small as their noise. A level returns minus infinity for hypotheses that fail them.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ Subject = TypeVar("Subject", bound="Hypothesis[Any]")
 class HypothesisOptions:
     """Thresholds of all decisions between hypotheses, in nats.
 
-    act : log-odds from which data are repaired, of which the user learns only afterwards; also the
-    log-odds by which a hypothesis excludes another.
-    report : log-odds from which a hypothesis is reported, as the reason of a refusal or as a
-    warning. The user can verify a report, so one false report in twenty is acceptable.
-    beam : log-likelihood ratio to the best explanation below which a hypothesis is dropped before
-    the next level of evidence: e^-12 = 6e-6, far less than a finer level changes.
-    most : hypotheses at most that go on to a level that costs seconds for each.
+    act : log-odds above which data are repaired and the user is informed afterwards; also the
+        log-odds by which a hypothesis excludes another.
+    report : log-odds above which a hypothesis is reported, as the reason of a refusal or as a
+        warning. The user can verify a report, so one false report in twenty is acceptable.
+    beam : log-likelihood ratio to the best explanation below which a hypothesis is discarded before
+        the next level of evidence: e^-12 = 6e-6, far less than a finer level changes.
+    most : maximum number of hypotheses for a level that takes seconds for each.
     """
 
     act: float = log(1000.0)
@@ -60,12 +60,15 @@ NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
 class Hypothesis(Generic[Data]):
     """Possible mistake in a session, as a transformation of its data.
 
-    code : of its finding, such as readings.exchanged. subject : the motor, station, file or image
-    concerned; hypotheses with one code and one subject are variants of one explanation. apply : the
-    data (of a session, of a station, of poses) as they would be without the mistake. log_prior :
-    prior log-odds, with the number of alternatives of the same kind and the cost of free parameters
-    (:func:`parameter_cost`). action : what follows where the hypothesis is decided for. facts : for
-    the finding, by name.
+    code : code of its finding, such as readings.exchanged.
+    subject : motor, station, file or image concerned. Hypotheses with one code and one subject are
+        variants of one explanation.
+    apply : function from the data (of a session, of a station, of poses) as stated to the data
+        without the mistake.
+    log_prior : prior log-odds. They contain the number of alternatives of the same kind and the
+        cost of free parameters (:func:`parameter_cost`).
+    action : what is done if the hypothesis is decided for.
+    facts : for the finding, by name.
     """
 
     code: str
@@ -77,16 +80,17 @@ class Hypothesis(Generic[Data]):
 
     @property
     def meaning(self) -> tuple[str, str]:
-        """Code and subject, which all variants of one explanation share."""
+        """Code and subject, common to all variants of one explanation."""
         return self.code, self.subject
 
 
 class EvidenceLevel(NamedTuple, Generic[Subject]):
     """Evidence by which hypotheses are compared.
 
-    log_likelihood_ratios : (N,) nats, of N hypotheses against the null; minus infinity for those
-    that are untenable. decides : whether the comparison may end here. most : hypotheses that go on
-    to the next level, without limit where None.
+    log_likelihood_ratios : function that returns (N,) nats of N hypotheses against the null; minus
+        infinity for untenable ones.
+    decides : whether the comparison may end at this level.
+    most : maximum number of hypotheses for the next level, None for no limit.
     """
 
     name: str
@@ -104,9 +108,12 @@ def estimate_level(
 ) -> EvidenceLevel[Subject]:
     """Level of evidence by an estimate under each hypothesis.
 
-    misfit : of the residuals without the mistake, as of :func:`log_likelihood`; raises one of
-    NO_ESTIMATE where there is none. null : misfit as stated. tenable : misfit from which a
-    hypothesis explains nothing. failed : called with hypotheses without an estimate, and why.
+    misfit : function that returns the misfit (:func:`log_likelihood`) of the residuals without the
+        mistake; it raises one of NO_ESTIMATE where there is no estimate.
+    null : misfit of the data as stated.
+    n_effective : number of independent residuals.
+    tenable : misfit above which a hypothesis is untenable.
+    failed : callback with each hypothesis without an estimate, and the reason.
     """
 
     def ratios(hypotheses: Sequence[Subject]) -> Array:
@@ -133,8 +140,9 @@ class Ranked(NamedTuple, Generic[Subject]):
 class Explanation(NamedTuple):
     """Decision between the hypotheses about one kind of data.
 
-    error : names the mistake; None if no hypothesis is likely enough. log_odds : of the mistake,
-    nats. untested : notes on hypotheses that could not be tested.
+    error : error that names the mistake; None if no hypothesis is likely enough.
+    log_odds : of the mistake, nats.
+    untested : notes on hypotheses that could not be tested.
     """
 
     error: InputError | None = None
@@ -157,7 +165,7 @@ def posterior(
         if not ranked:
             break
         ratios = np.asarray(level.log_likelihood_ratios([one.hypothesis for one in ranked]))
-        # prior odds stay as they are, so only the likelihood shows what is worth more evidence
+        # prior odds are the same at all levels, so the likelihood alone decides what is retained
         least = max(float(ratios.max()), 0.0) - options.beam
         ranked = [
             Ranked(one.hypothesis, one.hypothesis.log_prior + float(ratio), level.name)
@@ -175,7 +183,7 @@ def posterior(
 def decide(
     ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
 ) -> Ranked[Subject] | None:
-    """The hypothesis to follow, None where none is likely enough for its action."""
+    """Hypothesis to follow, None if none is likely enough for its action."""
     if not ranked:
         return None
     limit = options.act if ranked[0].hypothesis.action == "repair" else options.report
@@ -183,8 +191,9 @@ def decide(
 
 
 def likely(ranked: Sequence[Ranked[Subject]]) -> list[Ranked[Subject]]:
-    """The hypothesis to follow, then the others to be reported that it does not exclude; empty
-    where none is likely enough.
+    """Hypothesis to follow, then its rivals to be reported; empty if none is likely enough.
+
+    A rival is an explanation that the first hypothesis does not exclude.
     """
     first = decide(ranked)
     rivals = rivals_of(ranked) if first else []
@@ -194,7 +203,9 @@ def likely(ranked: Sequence[Ranked[Subject]]) -> list[Ranked[Subject]]:
 def rivals_of(
     ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
 ) -> list[Ranked[Subject]]:
-    """Other explanations that the first of the ranked hypotheses does not exclude, each once."""
+    """Rivals of the first of the ranked hypotheses: other explanations that it does not exclude,
+    each once.
+    """
     first, out = ranked[0], dict[tuple[str, str], Ranked[Subject]]()
     for one in ranked[1:]:
         if one.log_odds > first.log_odds - options.act:
@@ -204,10 +215,10 @@ def rivals_of(
 
 
 def refuse(*explanations: Callable[[], Explanation]) -> tuple[Finding, ...]:
-    """Raise the error of the likeliest explanation; notes on what could not be tested where none
-    has an error.
+    """Raise the error of the likeliest explanation; otherwise return notes on untested hypotheses.
 
-    explanations : the cheapest first. Later ones are not computed once one has odds of ``act``.
+    explanations : functions, the cheapest first. Later ones are not called once one has log-odds of
+        ``act``.
     """
     likeliest, untested = Explanation(), list[Finding]()
     for explain in explanations:
@@ -230,21 +241,23 @@ def parameter_cost(count: int, n_effective: float) -> float:
 def harmless_misfit(
     n_effective: float, log_prior: float, log_odds: float = OPTIONS.report
 ) -> float:
-    """Misfit of the data as stated, as of :func:`log_likelihood`, up to which a hypothesis that
-    leaves the stated noise does not reach the log-odds.
+    """Misfit of the data as stated (:func:`log_likelihood`) up to which no hypothesis is searched.
 
-    One that leaves less than the stated noise could; it is not searched, since the data as stated
-    fit nearly as well. log_prior : of the most probable hypothesis.
+    A hypothesis whose residuals have the stated noise does not reach ``log_odds`` there. One with
+    smaller residuals could, but the data as stated fit nearly as well.
+
+    log_prior : of the most probable hypothesis.
     """
     return math.exp((log_odds - log_prior) / max(n_effective, 1.0))
 
 
 def log_likelihood(misfit: Array, n_effective: float) -> Array:
-    """Log-likelihood (nats) of residuals by their root mean square ``misfit``, in stated standard
-    deviations, up to a constant.
+    """Log-likelihood (nats) of residuals with a root mean square ``misfit``, up to a constant.
 
-    Their true scale s is unknown, no smaller than stated and otherwise the likeliest, so that an
-    imperfect model does not make small differences decisive: -n (log s + misfit^2 / (2 s^2)).
+    The misfit is in stated standard deviations. The true scale s of the noise is unknown: at least
+    the stated one, and otherwise at its maximum-likelihood value, so that an imperfect model does
+    not make small differences decisive: -n (log s + misfit^2 / (2 s^2)).
+
     n_effective : number n of independent residuals.
     """
     misfit = np.asarray(misfit, dtype=float)

@@ -1,8 +1,8 @@
 """Progress of a command: a text and the share done, from 0 to 1, which never decreases.
 
-A task divides its range among its steps by :func:`part`; each step reports shares of its own, from
-0 to 1, and need not know its place in the whole. A step that is repeated until it converges gives
-each repetition a part of what remains. The outermost task is a :func:`whole` one.
+A task divides its range among its steps by :func:`part`; each step reports its own share, from 0 to
+1, independent of its place in the whole. A step that is repeated until it converges gives each
+repetition a part of what remains. The outermost task is a :func:`whole` one.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ EXCHANGE_ROUNDS = 12
 """Maximum number of exchange rounds; three are usually enough."""
 LEAST_READING_DIFFERENCE = 0.1
 """Minimum difference of some motor's reading, relative to its range, between two configurations of
-one group. A repeated image shows the same shading in front of the same background: its errors are
-the same, however often it is counted.
+one group. A repeated image has the same shading and the same background, so its errors are the same
+and do not average out.
 """
 EXCHANGE_GAIN_ROUNDING = 1e-6
 """Relative gain below which an exchange is rounding."""
@@ -138,8 +138,8 @@ class _Work:
     def best(self, group: int, taken: list[int]) -> int:
         """Candidate of a group that minimizes the variance of the tool.
 
-        Excluded are the candidates taken and those too close to one of the group's; among equal
-        ones the candidate with the least total variance is returned.
+        Candidates that are chosen already, or too close to a chosen one of the group, are excluded;
+        among equal ones the candidate with the least total variance is returned.
         """
         # Decrease of the variance by each candidate to first order.
         now = self.machine

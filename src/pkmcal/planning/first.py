@@ -1,5 +1,5 @@
-"""Information of edges, estimated from a session's first images, for the prediction of all further
-ones.
+"""Information of edges, estimated from a session's first images, for the prediction of further
+images.
 
 A station's first images are measured as `calibrate` measures them. The distribution of the
 information of their edges, in pixels and with lost edges as zero, predicts that of edges in further
@@ -36,12 +36,12 @@ FIRST_IMAGES_A_STATION = 3
 capture.
 """
 FIRST_IMAGES_MEASURED = 6
-"""Number of measured images of all stations together: those of a hexapod show forty edges of each
-kind, enough to know their scatter to a tenth.
+"""Number of measured images of all stations together: those of a hexapod contain forty edges of
+each kind, which determine their scatter to a tenth.
 """
 SHARED_EDGES_WEIGHT = 2.0
-"""Weight of all edges of a kind at a station, in numbers of edges, relative to the leg's own: it
-limits the influence of chance in three images.
+"""Weight, as a number of edges, of the edges of the same kind of all legs at a station, beside
+those of the leg itself: it limits the influence of chance in three images.
 """
 EXACT_EDGE_NOISE = EdgeNoise(1e-3, 1e-3)
 """Negligible noise (px) of edges that are simulated for their position and their turn by a
@@ -53,8 +53,10 @@ FIRST_EDGES_SEED = 7
 class EdgePool(NamedTuple):
     """Samples of the information of an edge.
 
-    information : (n, 2, 2), px^-2 of shift and tilt. weight : (n,). length : (n,) of the sampled
-    edges, px. shading : px, individual.
+    information : (n, 2, 2), px^-2 of shift and tilt.
+    weight : (n,) of the samples.
+    length : (n,) of the sampled edges, px.
+    shading : px, standard deviation of each edge's own shading.
     """
 
     information: Array
@@ -65,7 +67,7 @@ class EdgePool(NamedTuple):
     def chances(self, length: Array) -> Array:
         """Probabilities (m, n) of each sample, for edges of m lengths in px.
 
-        Long edges are found more often and have more information, so samples are weighted by a
+        Long edges are detected more often and have more information, so samples are weighted by a
         Gaussian kernel over the logarithm of the length (bandwidth by Scott's rule).
         """
         at = np.log(self.length)
@@ -87,8 +89,9 @@ Pools = tuple[EdgePool, ...]
 class EdgesOf:
     """Edges (k, E) of a station's first images, in the order of ``tubes_of``.
 
-    images : (k,) numbers of the images. expected : edges whose larger part is visible. valid :
-    expected edges that were measured and are inliers.
+    images : (k,) numbers of the images.
+    expected : edges whose larger part is visible.
+    valid : expected edges that were measured and are inliers.
     """
 
     images: Integers
@@ -98,10 +101,11 @@ class EdgesOf:
 
 @dataclass(frozen=True)
 class FirstEdges:
-    """Estimate by the first images.
+    """Estimate from the first images, and the information of their edges.
 
-    estimate : by these images only. pools, edges : by station. sigma : (S, L) median standard
-    deviation of a leg's edges, px across.
+    estimate : from these images only.
+    pools, edges : by station.
+    sigma : (S, L) median standard deviation of a leg's edges, px across.
     """
 
     estimate: Estimate
@@ -113,12 +117,11 @@ class FirstEdges:
 def spread_over(
     configuration: Integers, n_stations: int = 1, most: int = FIRST_IMAGES_A_STATION
 ) -> Integers:
-    """Indices of a station's images to be measured: of different configurations, spread over all of
-    them.
+    """Indices of the images of a station to be measured, of configurations spread over all.
 
-    configuration : (n,) of the images. most : maximum for each station; the maximum for all
-    stations together is in the ratio of FIRST_IMAGES_MEASURED to FIRST_IMAGES_A_STATION
-    to it.
+    configuration : (n,) of the images.
+    most : maximum for each station. The maximum for all stations together is larger by the ratio of
+        FIRST_IMAGES_MEASURED to FIRST_IMAGES_A_STATION.
     """
     most = min(most, -(-most * FIRST_IMAGES_MEASURED // (FIRST_IMAGES_A_STATION * n_stations)))
     first = np.sort(np.unique(configuration, return_index=True)[1])
@@ -134,9 +137,12 @@ def first_edges(
 ) -> FirstEdges:
     """Measure the edges of the first images, by a search and one measurement pass.
 
-    station_images : of S stations. rows : indices of the images to be measured, by station.
-    T_camera_base : (S, 4, 4) localized poses. poses : T_base_platform (K, 4, 4) by the nominal
-    model. Raises PkmcalError if there are too few edges for an estimate.
+    station_images : of S stations.
+    rows : indices of the images to be measured, by station.
+    T_camera_base : (S, 4, 4) localized poses.
+    poses : T_base_platform (K, 4, 4) by the nominal model.
+
+    Raises PkmcalError if there are too few edges for an estimate.
     """
     machine = session.machine
     numbers = numbered(session.camera_of_station[[p.station for p in station_images]])
@@ -244,9 +250,14 @@ def _pools(
 ) -> Pools:
     """Pools of a station's edges (E,): samples of the tube's own edge and of all edges of its kind.
 
-    values : (K, E, 2, 2) information, zero if lost. length : (K, E), px. expected : (K, E). kind :
-    (E, 2) tube and side. shading : (E,) px. Samples are kept, because a mean would predict more
-    than edges of which some have much information and others none.
+    values : (K, E, 2, 2) information, zero if lost.
+    length : (K, E), px.
+    expected : (K, E).
+    kind : (E, 2) tube and side.
+    shading : (E,) px.
+
+    Samples are kept instead of their mean: edges of which some have much information and others
+    none determine a pose less well than edges with the mean information.
     """
     out: list[EdgePool] = []
     for e in range(values.shape[1]):
@@ -269,8 +280,8 @@ def _pools(
 def drawn_edges(
     machine: Machine, edges: EdgeSet, pools: Sequence[Pools], rng: np.random.Generator | None
 ) -> EdgeSet:
-    """Edges with :data:`EXACT_EDGE_NOISE` noise, given an information drawn at random from the
-    pools.
+    """Edges with the noise :data:`EXACT_EDGE_NOISE` replaced by information drawn at random from
+    the pools.
 
     Edges with no information are removed. Without ``rng`` each edge has the mean information of its
     pool.

@@ -3,16 +3,16 @@
 The rows of each candidate on the shared unknowns are computed once, by the Jacobian of the joint
 estimate at the current machine, with the platform's pose of that configuration eliminated (Schur
 complement). The information of any selection is the prior information plus the sum of ``R^T R``
-over its candidates; nuisance parameters (stations, edge shifts, shading, mounts) remain unknowns,
-so the predicted covariance is that which the estimate will state.
+over its candidates. Nuisance parameters (stations, edge shifts, shading, mounts) remain unknowns,
+so the predicted covariance is the one that the estimate will state.
 
       machine  stations, shifts, ...
     [   R_1 (candidate 1)        ]
     [   R_2 (candidate 2)        ]      information = prior + sum_k R_k^T R_k
     [   ...                      ]
 
-The machine is expressed by the p directions that gauge and conventions leave, in prior sigmas, so
-that no frame is preferred.
+The machine is expressed in the p directions that gauge and conventions do not fix, in prior sigmas,
+so that no frame is preferred.
 """
 
 from __future__ import annotations
@@ -56,8 +56,10 @@ as the length of an axis.
 class Candidates:
     """Candidate measurements: n configurations, each measured by one of G groups of stations.
 
-    groups : stations that measure a configuration together. group : (n,) index of the group, in
-    increasing order. joints : (n, m). T_base_platform : (n, 4, 4).
+    groups : stations that measure a configuration together.
+    group : (n,) index of the group, in increasing order.
+    joints : (n, m) readings.
+    T_base_platform : (n, 4, 4).
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -88,11 +90,11 @@ class Candidates:
 
 
 class Directions(NamedTuple):
-    """Directions of the machine's free parameters z that gauge and conventions leave, in prior
-    sigmas.
+    """The p directions of the machine's free parameters z apart from gauge and conventions, in
+    prior sigmas.
 
-    to_z : (nz, p). of_z : (p, nz) the inverse map. span : (nz, g) changes of z by gauge and
-    conventions.
+    to_z, of_z : (nz, p) and the inverse map (p, nz).
+    span : (nz, g) changes of z by gauge and conventions.
     """
 
     to_z: Array
@@ -104,11 +106,13 @@ class Directions(NamedTuple):
 class CandidateRows:
     """Rows of all candidates, with the prior information.
 
-    rows : (n, r, na) on the shared unknowns in their own units. group : (n,) index of the group of
-    stations, in increasing order. where : (n, m) readings relative to the motors' ranges.
-    information : (na, na) prior information, with that of the nominal model. machine : (p, na)
-    directions of the machine; the nominal model alone gives each a variance of one. work : (M, 6,
-    p) turn and shift of the platform at M poses of the workspace by each direction, rad and m.
+    rows : (n, r, na) on the shared unknowns in their own units.
+    group : (n,) index of the group of stations, in increasing order.
+    where : (n, m) readings relative to the motors' ranges.
+    information : (na, na) prior information, including the nominal model's.
+    machine : (p, na) directions of the machine, each with a variance of one by the nominal model.
+    work : (M, 6, p) rotation and shift of the platform at M poses of the workspace by each
+        direction, rad and m.
     """
 
     rows: Array
@@ -153,11 +157,13 @@ def information_of(
 ) -> CandidateRows:
     """Rows of all candidates.
 
-    work : T_base_platform (M, 4, 4) of the workspace. calibration_prior : prior of an earlier
-    calibration, in place of the nominal model. rng : as for
-    :meth:`~pkmcal.planning.rig.LegsFrom.measure`. wanted : number of each group that will be
-    measured, by default all: it determines the correlation of edges with common shading. Raises
-    InputError if a group of stations measures nothing in any configuration.
+    work : T_base_platform (M, 4, 4) of the workspace.
+    calibration_prior : prior of an earlier calibration, in place of the nominal model.
+    rng : as for :meth:`~pkmcal.planning.rig.LegsFrom.measure`.
+    wanted : number of each group that will be measured, by default all: it determines the
+        correlation of edges with common shading.
+
+    Raises InputError if a group of stations measures nothing in any configuration.
     """
     machine, joints, poses = rig.machine, candidates.joints, candidates.T_base_platform
     measurements = rig.measured(joints, poses, candidates.pairs, rng)
@@ -170,7 +176,7 @@ def information_of(
     # Rows of each candidate, its platform pose eliminated.
     reduced = eliminate(problem.linearize(state)).rows[0]
     rows = np.zeros((len(joints), *reduced.shape[1:]))
-    rows[assembled.observed] = reduced  # candidates that show nothing have no information
+    rows[assembled.observed] = reduced  # candidates without measurements have no information
     # Prior information: of the nominal model, stations and mounts, or of an earlier calibration.
     prior = problem.prior
     if calibration_prior is not None:  # it includes the nominal model's priors

@@ -70,8 +70,10 @@ PLAN = PlanOptions()
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Standard deviations of the platform's position (m) and turn (rad), mean over the workspace,
-    with ``count`` configurations at each station.
+    """Predicted standard deviations of the platform's position (m) and rotation (rad), means over
+    the workspace.
+
+    count : number of configurations at each station.
     """
 
     count: float
@@ -83,8 +85,9 @@ class Accuracy:
 class TriedStation:
     """Candidate pose of a camera.
 
-    alone : standard deviation (m) of the platform's position with all configurations observed from
-    there. chosen : whether it is part of the plan.
+    alone : standard deviation (m) of the platform's position if all configurations are observed
+        from there.
+    chosen : whether it is part of the plan.
     """
 
     place: StationPose
@@ -96,15 +99,20 @@ class TriedStation:
 class MeasurementPlan:
     """Planned measurements, in the order of the path through them.
 
-    subject : subject of the plan, with the chosen stations if these were free. stations : (n,)
-    tuples of names of the stations that measure each configuration. names, joints (n, m),
-    T_base_platform (n, 4, 4) : the configurations; those of ``rank`` up to k are the best k at each
-    station. now, promised, by_chance :
-    accuracy before the plan, with it, and with random configurations. curve : accuracy with fewer
-    and with more configurations. region : the workspace, work : its poses. blocked : (n,) True if
-    the machine cannot take the straight path to a configuration, or its legs touch on it. travel :
-    total motion of the slowest motor, relative to its range, on the planned and on a random path.
-    tried : candidate stations. together : whether all stations measure each configuration.
+    subject : subject of the plan, with the chosen stations if these were free.
+    stations : (n,) tuples of names of the stations that measure each configuration.
+    names, joints, T_base_platform : configurations, (n,), (n, m) and (n, 4, 4).
+    rank : (n,) order of the configurations at each station: those up to k are the best k.
+    now, promised, by_chance : accuracy before the plan, with the plan, and with random
+        configurations.
+    curve : accuracy with fewer and with more configurations.
+    region, work : workspace, and its poses.
+    blocked : (n,) True if the machine cannot take the straight path to a configuration, or its legs
+        touch on it.
+    travel : total motion of the slowest motor, relative to its range, on the planned and on a
+        random path.
+    tried : candidate stations.
+    together : whether all stations measure each configuration.
     """
 
     subject: Subject
@@ -152,13 +160,17 @@ def plan_measurements(
 ) -> MeasurementPlan:
     """Plan measurements for a subject.
 
-    count : configurations at each station; in total, if all stations measure together. region :
-    workspace in which the tool's accuracy counts; by default all reachable poses. together :
-    whether all stations measure every configuration; by default if they have cameras of their own
-    or there is a tracker. free_stations : number of stations to choose on a sphere around the
-    machine. best_of : number of the rig's stations to choose. seed : of all random numbers.
-    progress : callback with the share done. options : of the search. Raises InputError for what
-    cannot be planned.
+    count : configurations at each station; in total, if all stations measure together.
+    region : workspace over which the tool's accuracy is averaged, by default all reachable poses.
+    together : whether all stations measure every configuration; by default if they have cameras of
+        their own or there is a tracker.
+    free_stations : number of stations to choose on a sphere around the machine.
+    best_of : number of the rig's stations to choose.
+    seed : seed for all random numbers.
+    progress : callback with the share done.
+    options : of the search.
+
+    Raises InputError for what cannot be planned.
     """
     progress = progress or (lambda _share: None)
     rig, rng = subject.rig, np.random.default_rng(seed)
@@ -176,7 +188,7 @@ def plan_measurements(
         )
         subject = replace(subject, rig=rig, prior=prior)
     progress(0.3)
-    if together is None:  # one camera is carried; several, or a tracker, measure at once
+    if together is None:  # one camera is moved between stations; several measure simultaneously
         tracked = any(isinstance(one, TargetFrom) for one in rig.instruments)
         several = tracked or len(np.unique(rig.camera_of_station)) > 1
         together = len(rig.names) > 1 and several

@@ -1,8 +1,8 @@
 """Instruments of a plan: cameras that observe legs or a board, and trackers, each at its station.
 
 An instrument predicts its measurements of the machine at given poses, without errors but with their
-covariance, in the form that images and tables give. Nothing is measured outside the image, behind a
-leg, or on the back of a board.
+covariance, in the same form as real measurements. There are no measurements outside the image,
+behind a leg, or on the back of a board.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.poses import BOARD_POSE_OPTIONS, pose_set
+from pkmcal.calibration.reading_effects import reading_effects
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse, skew
 from pkmcal.identify.assembly import Assembled, assemble, batch_of
@@ -89,7 +90,9 @@ class LegsFrom:
 class BoardFrom:
     """Board on the platform, observed by a camera at T_camera_base (4, 4).
 
-    points : (N, 3) corners, board frame, m. T_platform_board : (4, 4). sigma : of a corner, px.
+    points : (N, 3) corners, board frame, m.
+    T_platform_board : (4, 4).
+    sigma : of a corner, px.
     mount : its index.
     """
 
@@ -164,10 +167,15 @@ Instrument = LegsFrom | BoardFrom | TargetFrom
 class Rig:
     """Machine with its instruments.
 
-    names : of S stations. T_station_base : (S, 4, 4) of cameras and trackers. camera_of_station :
-    (S,) index of the camera. joint_noise : of a reading. mounts : of boards and targets, with poses
-    T_mount (M, 4, 4). shading : px, standard deviation of the shift that edges of one side of a
-    tube at one station share. where : prefix of a station's name in messages; None without a file.
+    names : of S stations.
+    T_station_base : (S, 4, 4) of cameras and trackers.
+    camera_of_station : (S,) index of the camera.
+    joint_noise : standard deviation of a reading, m or rad.
+    mounts : of boards and targets, with poses T_mount (M, 4, 4).
+    shading : px, standard deviation of the common shift of edges of one side of a tube at one
+        station.
+    where : prefix of a station's name in messages; None without a file.
+    temperatures : of the configurations, repeated in their order; None without a column of them.
     """
 
     machine: Machine
@@ -180,6 +188,7 @@ class Rig:
     T_mount: Array | None = None
     shading: float = SHADING_SIGMA
     where: str | None = "session.yaml, stations."
+    temperatures: Array | None = None
 
     __repr__ = short_repr
 
@@ -226,6 +235,12 @@ class Rig:
             poses=concatenate(poses),
             mounts=self.mounts,
             shaded=len(edges) > 0,
+            effects=reading_effects(
+                self.machine,
+                joints,
+                T_base_platform,
+                None if self.temperatures is None else np.resize(self.temperatures, len(joints)),
+            ),
         )
 
     def assembled(

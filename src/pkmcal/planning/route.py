@@ -33,7 +33,8 @@ def shortest_path(
 ) -> Integers:
     """Order (n,) of points that makes an open path through all of them short.
 
-    apart : (n, n) distances. first : (n,) distances from the start of the path; None for any start.
+    apart : (n, n) distances.
+    first : (n,) distances from the start of the path; None for any start.
     barred : (n, n) steps to be avoided if possible.
 
     Nearest neighbour, then reversed stretches (2-opt, Croes 1958) and moved stretches (Or 1976),

@@ -63,9 +63,12 @@ BOARD_MOUNT_NAME = "board"
 class Subject:
     """Subject of a plan.
 
-    rig : machine and instruments. prior : of an earlier calibration. columns : of joints.csv. names
-    : of existing configurations. words : sentences on the sources of its numbers. board : fields of
-    the board's file, if a board is observed.
+    rig : machine and instruments.
+    prior : prior of an earlier calibration.
+    columns : columns of joints.csv.
+    names : of existing configurations.
+    words : sentences on the sources of its numbers.
+    board : fields of the board's file, if a board is observed.
     """
 
     rig: Rig
@@ -146,9 +149,11 @@ def of_machine(
 ) -> Subject:
     """Subject with a machine and a hypothetical camera or tracker.
 
-    cameras : one for each station. board : on the platform, observed instead of the legs. tracker :
-    standard deviations of its positions (m) and turns (rad; None if it measures points), instead of
-    cameras. edge, corner : standard deviations, px.
+    cameras : one for each station.
+    board : on the platform, observed instead of the legs.
+    tracker : standard deviations of its positions (m) and turns (rad; None if it measures points),
+        instead of cameras.
+    edge, corner : standard deviations, px.
     """
     rng = np.random.default_rng(seed)
     noise = f"Readings are taken to be good to {brief(joint_noise * 1e6)} µm (or µrad)"
@@ -238,11 +243,12 @@ def subject_of_session(
 ) -> Subject:
     """Subject of a session, by its nominal model, its first images, or an earlier calibration.
 
-    saved : calibration of this machine, the source of its values, stations and prior. same_place :
-    whether cameras still have the poses of that calibration. anywhere : whether poses of its first
-    camera are to be chosen, so that none must be given. edge, corner : px, standard deviations for
-    a session without images. Raises InputError if the pose of a station is not known, or for
-    hand-held cameras.
+    saved : calibration of this machine, the source of its values, stations and prior.
+    same_place : whether cameras still have the poses of that calibration.
+    anywhere : whether poses of its first camera are to be chosen, so that none must be given.
+    edge, corner : px, standard deviations for a session without images.
+
+    Raises InputError if the pose of a station is not known, or for hand-held cameras.
     """
     if anywhere:
         session = _first_camera_session(session)
@@ -334,6 +340,7 @@ def _rig(
         tuple(mounts),
         np.array(T_mount).reshape(-1, 4, 4),
         shading,
+        temperatures=session.temperature,
     )
     return rig, board, words
 

@@ -30,6 +30,7 @@ from pkmcal.wording import (
     capital,
     decimals,
     joined,
+    listed,
     named,
     number,
     percent,
@@ -42,6 +43,8 @@ TIGHT_CORRELATION = 0.95
 At this value their combination is known 3.2 times better than each alone.
 """
 MOST_TIGHT_PAIRS = 6
+MOST_BY_NOMINAL = 12
+"""Names in the sentence on parameters that the nominal model decides."""
 PARAMETER_SOURCES = {
     "data": "data",
     "drawing": "nominal",
@@ -118,7 +121,20 @@ def section(nominal: Machine, estimate: Estimate) -> Part:
     return Part(
         "parameters",
         "Parameters",
+        _by_nominal(estimates),
         blocks=(*changes(estimates), parameter_table(estimates, estimate.gauge), files),
+    )
+
+
+def _by_nominal(estimates: ParameterEstimates) -> tuple[str, ...]:
+    """Sentence on the parameters that the nominal model decides more than the data do."""
+    names = tuple(one.name for one in estimates if one.decided_by == "drawing")
+    if not names:
+        return ()
+    words = listed(grouped(estimates.table, names), MOST_BY_NOMINAL)
+    return (
+        "The data determine these less than the nominal model's tolerances do, so their values"
+        f" are mostly the nominal ones: {words}.",
     )
 
 

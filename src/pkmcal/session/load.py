@@ -143,7 +143,7 @@ class Session:
     workspace : region in which the tool must be accurate; None if not stated.
     rejected : stations that were removed because their images do not determine their poses.
     links : measurements that depend on two configurations, by kind.
-    temperature : (K,) °C or K, of the configurations; None where joints.csv has none.
+    temperature : (K,) °C, of the configurations; None where joints.csv has none.
     """
 
     folder: Path
@@ -195,8 +195,13 @@ class Session:
     @property
     def heights_alone(self) -> bool:
         """Whether the session has only heights of a bed."""
+        return self.of_a_bed and not self.links
+
+    @property
+    def of_a_bed(self) -> bool:
+        """Whether all poses were measured by heights of a bed, whatever links there are."""
         felt = bool(self.trackers) and all(table.kind == Heights.code for table in self.trackers)
-        return felt and not self.stations and not self.links
+        return felt and not self.stations
 
     @property
     def station_names(self) -> tuple[str, ...]:

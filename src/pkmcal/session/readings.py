@@ -34,18 +34,41 @@ _UNITS = {
 column's head."""
 
 
-TEMPERATURE_HEAD = re.compile(r"temperature(?: ?[\[(](?:°C|degC|C|K)[\])])?")
-"""Head of the column of temperatures."""
+MULTIPLE_ROUNDING = 1e-6
+"""Difference of a reading from a whole multiple of a step, in steps, that is rounding."""
+TEMPERATURE_HEAD = re.compile(r"temperature(?: ?[\[(](?:°C|degC|C|(K))[\])])?")
+"""Head of the column of temperatures; its group is kelvin."""
+ICE_POINT = 273.15
+"""0 °C, K."""
 
 
 def without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
-    """Table of the readings alone, and the temperatures (K,) of its last column, if it has one."""
-    if not table.columns or not TEMPERATURE_HEAD.fullmatch(table.columns[-1]):
+    """Table of the readings alone, and the temperatures (K,) of its last column, °C, if it has one;
+    those without a unit are as they are.
+    """
+    head = TEMPERATURE_HEAD.fullmatch(table.columns[-1]) if table.columns else None
+    if head is None:
         return table, None
     readings = replace(
         table, columns=table.columns[:-1], values=table.values[:, :-1], units=table.units[:-1]
     )
-    return readings, table.values[:, -1]
+    return readings, table.values[:, -1] - (ICE_POINT if head[1] else 0.0)
+
+
+def rounding_step(readings: Array, unit: str, least: float) -> float | None:
+    """Largest round number, m or rad, of which all readings are whole multiples, as rounded numbers
+    and commands are; None if it is not above ``least``.
+
+    Round numbers are 1, 2 and 5 times a power of ten of metres, radians or degrees; readings with
+    more digits are whole multiples of none by chance. readings : of one unit, any shape.
+    """
+    scales = (1.0,) if unit == "m" else (1.0, np.pi / 180)
+    steps = [c * d * 10.0**k for c in scales for d in (1, 2, 5) for k in range(-7, 1)]
+    for step in sorted(steps, reverse=True):
+        counts = readings / step
+        if step > least and np.abs(counts - np.round(counts)).max() < MULTIPLE_ROUNDING:
+            return float(step)
+    return None
 
 
 def check_readings(

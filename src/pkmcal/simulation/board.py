@@ -1,8 +1,8 @@
-"""Calibration board in the simulated scene: exact geometry of its print, and a pose that is seen.
+"""Calibration board in the simulated scene: exact geometry of its print, and a visible pose.
 
-The board is a thin plate whose print is part of its shape. Black and white are faces of their own,
-so the renderer averages over the pixels between them as along every silhouette, and a printed
-corner is right to a hundredth of a pixel.
+The board is a thin plate whose print is part of its shape. Black and white are separate faces, so
+the renderer averages over the pixels between them as along every silhouette, and a printed corner
+is accurate to a hundredth of a pixel.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ HOLDER_ROD_RADIUS = 0.08
 PRINTED_BLACK_LIGHT = 0.06
 """Reflectance of printed black relative to white."""
 MADE_BOARD_SQUARES = {"base": (6, 5), "platform": (5, 4)}
-"""Squares (columns, rows) of a board made to measure: few and large, to be read from afar."""
+"""Squares (columns, rows) of a generated board: few and large, to be detected from a distance."""
 BASE_BOARD_DIAGONAL = 1.4
 """Diagonal of a board on the base with its margin, in radii of the base."""
 PLATFORM_BOARD_DIAGONAL = 2.0
 """Diagonal of a board on the platform with its margin, in radii of the platform."""
 PICTURED_BOARD_DIAGONAL = 0.75
-"""Least diagonal of a board on the platform, in radii of the machine's workspace. Cameras stand so
-far away that they see the whole workspace, and the board has to fill enough of the image."""
+"""Minimum diagonal of a board on the platform, in radii of the machine's workspace. Cameras are so
+far away that the whole workspace is in view, and the board has to fill enough of the image."""
 BOARD_TRIAL_CONFIGURATIONS = 6
 """Number of configurations at which candidate poses of a board are tried."""
 SLANTED_BOARD_COSINE = 0.6

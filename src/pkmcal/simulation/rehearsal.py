@@ -1,4 +1,4 @@
-"""Rehearsal of a plan: the inputs with which a session is simulated as ``pkmcal plan`` asks."""
+"""Inputs of the simulated session that rehearses a plan (``pkmcal plan``)."""
 
 from __future__ import annotations
 

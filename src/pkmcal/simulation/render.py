@@ -2,7 +2,7 @@
 
 Rays are cast in bundles of neighbours, (3, bundles, rays). A bundle lies in a narrow cone, and only
 shapes with a bounding ball in that cone are tested: the cost of a leg is proportional to its area
-in the image. The first hit is lit by the share of the lamp that the point sees.
+in the image. The first hit is lit by the share of the lamp that is visible from the point.
 
 Each pixel is sampled once through its centre. Where the label (shape, face, shadow) of a pixel
 differs from a neighbour's, the pixel is sampled again, so that its grey level is the mean over its
@@ -146,8 +146,10 @@ def lamp_visibility(
 class RayHits(NamedTuple):
     """First hits of rays, (bundles, rays) each.
 
-    light : radiance. label : integer that changes at every visible border; it encodes the shape,
-    its face, and whether the point is in shadow. visible : share of the lamp that the point sees.
+    light : radiance.
+    label : integer that changes at every visible border; it encodes the shape, its face, and
+        whether the point is in shadow.
+    visible : share of the lamp that is visible from the point.
     """
 
     light: Array
@@ -231,9 +233,11 @@ def _flat(rays: Array, rows: Integers) -> Array:
 class Sensor:
     """Lens blur and sensor.
 
-    blur : standard deviation of the point spread, px. exposure : grey levels for light 1.
-    read_noise : grey levels. shot_noise : variance for each grey level; the noise at level g has
-    the variance read_noise^2 + shot_noise g.
+    blur : standard deviation of the point spread, px.
+    exposure : grey levels for light 1.
+    read_noise : grey levels.
+    shot_noise : variance for each grey level; the noise at level g has the variance read_noise^2 +
+        shot_noise g.
     """
 
     blur: float = default("simulate", "blur")
@@ -323,8 +327,9 @@ def _over_area(
 ) -> Array:  # fmt: skip
     """Mean light (n,) over the area of each border pixel, in the order of the mask.
 
-    hits : (H, W) through the pixels' centres. Where a pixel and all its neighbours see the same
-    whole lamp, or none of it, so does every point between them; that holds for most borders.
+    hits : (H, W) of the rays through the pixels' centres. Where the lamp is entirely visible from a
+        pixel and all its neighbours, or entirely hidden from all of them, no shadow ray is cast for
+        the samples between; this holds for most borders.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 

@@ -75,8 +75,9 @@ class Discs:
     """Plates that carry the joints, and the actuators of the legs' ends on the base.
 
     base, platform : (3,) centre of the face towards the joints; base frame, platform frame.
-    base_radius, platform_radius : m. side : +1 where the platform stands above the base along the
-    frames' z, -1 below. platform_side : the same for the platform's plate relative to its joints.
+    base_radius, platform_radius : m.
+    side : +1 where the platform stands above the base along the frames' z, -1 below.
+    platform_side : the same for the platform's plate relative to its joints.
     thickness : m.
     """
 
@@ -300,8 +301,10 @@ def arm_parts(
 ) -> list[ScenePart]:
     """Arm of leg j with its hub, the motor beside it, and the motor's bracket.
 
-    chain : (k, 3) along the arm, from its motor to the leg's end. balls : (L,) radii of the joints.
-    plate : (3,) on the base plate's face. up : unit vector towards the legs.
+    chain : (k, 3) along the arm, from its motor to the leg's end.
+    balls : (L,) radii of the joints.
+    plate : (3,) on the base plate's face.
+    up : unit vector towards the legs.
     """
     foot, v, ball = drives.foot[j], drives.axis[j], float(balls[j])
     wide = motor_radius(float(np.linalg.norm(chain[-1] - foot)), ball)
@@ -424,8 +427,10 @@ def nacelle_parts(
 ) -> list[ScenePart]:
     """Side bars between the joints of their legs, each on a pivot, and the bar that joins them.
 
-    bars : legs of each bar. b : (L, 3) legs' ends. centre : (3,) of the tool's flange, m. up : unit
-    vector away from the joints.
+    bars : legs of each bar.
+    b : (L, 3) legs' ends.
+    centre : (3,) of the tool's flange, m.
+    up : unit vector away from the joints.
     """
     ball = float(balls.max())
     parts: list[ScenePart] = []

@@ -53,10 +53,13 @@ def simulate_session(
 ) -> Truth:
     """Write a simulated session into a new folder, completely or not at all.
 
-    The truth is written to truth.json. camera : one for all stations, or one for each. workers :
-    threads that render; the result does not depend on their number. progress : called with the
-    number of finished images and of all. Raises InputError if the folder is not empty or the
-    machine cannot be rendered.
+    The truth is written to truth.json.
+
+    camera : one for all stations, or one for each.
+    workers : threads that render; the result does not depend on their number.
+    progress : called with the number of finished images and of all.
+
+    Raises InputError if the folder is not empty or the machine cannot be rendered.
     """
     settings = settings or Settings()
     folder = Path(folder)
@@ -83,8 +86,10 @@ def _breathed(camera: Camera, scale: float) -> Camera:
 class Studio:
     """Everything that the images of one session share.
 
-    cameras : by station. views : rays of each camera with more than one image, by the camera's id.
-    fixed : parts that are fixed to the base. as_built : with motors, rings and cables on the legs.
+    cameras : by station.
+    views : rays of each camera with more than one image, by the camera's id.
+    fixed : parts that are fixed to the base.
+    as_built : with motors, rings and cables on the legs.
     """
 
     truth: Truth
@@ -192,7 +197,7 @@ def _write_texts(
     texts = {
         "mechanism.yaml": mechanism_text(nominal),
         "session.yaml": yaml_text(_session_document(settings, truth, files)),
-        "joints.csv": csv_text(nominal.joint_names, truth.configurations, truth.readings),
+        "joints.csv": _readings_text(nominal, truth),
         TRUTH_FILE: json.dumps(truth_document(truth), indent=1) + "\n",
     }
     if settings.board is not None:
@@ -203,6 +208,15 @@ def _write_texts(
         path = stage / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _readings_text(nominal: Machine, truth: Truth) -> str:
+    """joints.csv, with the temperatures where there are any."""
+    columns, values = nominal.joint_names, truth.readings
+    if truth.effects is not None and truth.effects.temperature is not None:
+        columns = (*columns, "temperature [°C]")
+        values = np.column_stack([values, truth.effects.temperature])
+    return csv_text(columns, truth.configurations, values)
 
 
 def _session_document(

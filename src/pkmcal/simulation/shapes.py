@@ -76,8 +76,9 @@ def _soft(clearance: Array, t: Array, distance: Array, spread: float, where: Boo
     """Occluded share (n,) of a lamp of radius ``spread`` behind the border of a shape.
 
     clearance : (n,) distance, in m, by which a ray misses the shape at its parameter t, negative
-    for a hit. distance : (n,) of the lit points from the lamp. where : (n,) rays that the shape can
-    occlude; zero for others.
+        for a hit.
+    distance : (n,) of the lit points from the lamp.
+    where : (n,) rays that the shape can occlude; zero for others.
     """
     hidden = np.zeros(clearance.shape)
     # most rays pass by: the lamp's penumbra at the shape is never wider than the lamp

@@ -126,12 +126,15 @@ class Slats(Pattern):
 class Material:
     """Surface properties.
 
-    albedo : diffuse reflectance. pattern : factor on the albedo. gloss, sharpness : strength and
-    exponent of a Blinn-Phong highlight. brushed : the highlight is elongated along a cylinder's
-    axis and narrow across (turned steel; Ward's model). mirror : share of the blurred surroundings
-    that a rough surface reflects. polish : share of a sharp reflection; at its limb a polished
-    shape reflects the background, and the contrast of its edge vanishes. emission : light of its
-    own.
+    albedo : diffuse reflectance.
+    pattern : factor on the albedo.
+    gloss, sharpness : strength and exponent of a Blinn-Phong highlight.
+    brushed : the highlight is elongated along a cylinder's axis and narrow across (turned steel;
+        Ward's model).
+    mirror : share of the blurred surroundings that a rough surface reflects.
+    polish : share of a sharp reflection; at its limb a polished shape reflects the background, and
+        the contrast of its edge vanishes.
+    emission : light of its own.
     """
 
     albedo: float = 0.5

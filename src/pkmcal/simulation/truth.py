@@ -22,6 +22,8 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
 from pkmcal.measurements.effects import FOCAL_SIGMA
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.disturbances import compliance, grown_readings, growth_of, sag
+from pkmcal.mechanisms.document import STIFFNESS_TOLERANCE
 from pkmcal.mechanisms.kinematics import driven_towards
 from pkmcal.placement.configurations import draw_configurations, platform_unfolded, same_mode
 from pkmcal.placement.stations import (
@@ -41,9 +43,12 @@ from pkmcal.simulation.render import Sensor
 TRUTH_FILE = "truth.json"
 RANDOM_STREAMS = (
     "machine", "stations", "configurations", "readings", "room", "photographs", "board", "focal",
+    "effects",
 )  # fmt: skip
 READING_ROUNDING = 1e-9
 """Difference, in m or rad, up to which two readings at the end of a range are equal: rounding."""
+ROOM_TEMPERATURE = 20.0
+"""Temperature, °C, from which a machine warms."""
 HANDHELD_STATION_NAME = "phone"
 """Name in session.yaml of a station with a hand-held camera."""
 
@@ -64,19 +69,26 @@ class RequestedConfigurations:
 class Settings:
     """Properties of a simulated session.
 
-    stations : their number, or their poses. configurations : number of images of each station.
-    shared : all stations see the same configurations; by default each has its own. tolerance :
-    standard deviation of the true values about the nominal model, in prior sigmas. joint_noise :
-    standard deviation of a reading, m. rough_position, rough_angle : errors of the session's
-    station poses, m and rad. extreme : share of configurations with every leg near an end of its
-    range, as far as there are that many different poses. board : board that every station sees,
-    fixed to ``board_on``. observe : value of ``observe`` in session.yaml for stations that see a
-    board. repeats : images of each configuration from each station, with independent sensor noise.
-    shake : standard deviations (m, rad) of the camera's motion between repeats. finish, light : of
-    the legs and of the room. as_built : motors, rings and cables on the legs that are not in the
-    nominal model. asked : these configurations instead of random ones. handheld : each image from a
-    pose of its own about the machine, ``repeats`` of each configuration, with focal lengths that
-    vary by ``breathing``, one standard deviation; ``stations`` is then ignored.
+    stations : number of stations, or their poses.
+    configurations : number of images of each station.
+    shared : whether all stations observe the same configurations; by default each has its own.
+    tolerance : standard deviation of the true values about the nominal model, in prior sigmas.
+    joint_noise : standard deviation of a reading, m.
+    rough_position, rough_angle : errors of the session's station poses, m and rad.
+    extreme : share of configurations with every leg near an end of its range, as far as there are
+        that many different poses.
+    board : board that every station observes, fixed to ``board_on``.
+    observe : value of ``observe`` in session.yaml for stations that observe a board.
+    repeats : images of each configuration from each station, with independent sensor noise.
+    shake : standard deviations (m, rad) of the camera's motion between repeats.
+    finish, light : of the legs and of the room.
+    as_built : whether legs have motors, rings and cables that are not in the nominal model.
+    asked : requested configurations, instead of random ones.
+    handheld : whether each image has a pose of its own around the machine, with ``repeats`` images
+        of each configuration and focal lengths with the relative standard deviation ``breathing``;
+        ``stations`` is then ignored.
+    warming : K, increase of the machine's temperature over the session. The readings contain the
+        growth of drives and frame, the images show the machine as it is at first.
     """
 
     stations: int | tuple[StationPose, ...] = default("simulate", "stations")
@@ -98,6 +110,7 @@ class Settings:
     as_built: bool = False
     handheld: bool = False
     breathing: float = FOCAL_SIGMA
+    warming: float = default("simulate", "warming")
     asked: RequestedConfigurations | None = None
 
     @property
@@ -109,15 +122,62 @@ class Settings:
 
 
 @dataclass(frozen=True)
+class TrueEffects:
+    """True effects on the readings.
+
+    compliance : of the drives, relative to the stated one; None without a stated one. temperature :
+    (K,) of the configurations. growth : (2,) of drives and frame, 1/K; None without temperatures.
+    """
+
+    compliance: float | None = None
+    temperature: Array | None = None
+    growth: Array | None = None
+
+    @classmethod
+    def draw(
+        cls, nominal: Machine, warming: float, count: int, rng: np.random.Generator
+    ) -> TrueEffects:
+        """Random effects by the stated stiffness and growth, by default the usual growth."""
+        compliant, temperature, growth = None, None, None
+        if compliance(nominal) is not None:
+            tolerance = nominal.document.tolerance.stiffness or STIFFNESS_TOLERANCE
+            # a compliance is positive
+            compliant = float(np.exp(tolerance * rng.standard_normal()))
+        if warming:
+            # as a body that is heated evenly, to 95 % of its last temperature
+            warmer = np.expm1(-3 * np.linspace(0, 1, count)) / np.expm1(-3)
+            temperature = ROOM_TEMPERATURE + warming * warmer
+            stated = growth_of(nominal, temperature)
+            growth = rng.normal([stated.drives, stated.frame], stated.sigma)
+        return cls(compliant, temperature, growth)
+
+    def readings(self, machine: Machine, joints: Array, poses: Array) -> Array:
+        """Readings (K, m) of drives that are at ``joints`` (K, m), at poses (K, 4, 4)."""
+        if self.compliance is not None:
+            joints = joints - self.compliance * sag(machine, poses)
+        if self.temperature is None or self.growth is None:
+            return joints
+        warmer = self.temperature - growth_of(machine, self.temperature).temperature
+        grown = grown_readings(machine, poses, warmer[:, None] * self.growth)
+        return joints + grown - machine.inverse(poses)
+
+
+@dataclass(frozen=True)
 class Truth:
     """Values that a user never has, in the base frame of the true machine's centres.
 
-    machine : with its true values. stations, configurations : names, S and K.
-    T_camera_base : (S, 4, 4). rough : station poses in session.yaml. T_base_platform : (K, 4, 4).
-    joints : (K, m) exact readings. readings : (K, m) with noise. images : (M, 2) numbers of
-    the station and the configuration of each image. seed : seed of all random numbers.
-    T_base_board, T_platform_board : (4, 4) pose of the board, if any. repeats : images of each
-    pair. focal_scale : (S,) factors on the camera's focal lengths, for hand-held images.
+    machine : with its true values.
+    stations, configurations : names, S and K.
+    T_camera_base : (S, 4, 4).
+    rough : station poses in session.yaml.
+    T_base_platform : (K, 4, 4).
+    joints, readings : (K, m) exact readings, and readings with noise.
+    images : (M, 2) numbers of the station and the configuration of each image.
+    seed : seed for all random numbers.
+    T_base_board, T_platform_board : (4, 4) pose of the board, if any.
+    repeats : number of images of each pair.
+    focal_scale : (S,) factors on the camera's focal lengths, for hand-held images.
+    effects : on the readings: temperatures, growth and compliance.
     """
 
     machine: Machine
@@ -134,6 +194,7 @@ class Truth:
     repeats: int = 1
     T_platform_board: Array | None = None
     focal_scale: Array | None = None
+    effects: TrueEffects | None = None
 
     __repr__ = short_repr
 
@@ -162,6 +223,7 @@ def draw_truth(
 
     cameras : one for each station; for hand-held images without their breathing.
     """
+    # true machine; stations, and their poses as session.yaml states them
     rngs = {name: np.random.default_rng(stream(seed, name)) for name in RANDOM_STREAMS}
     machine = true_machine(nominal, settings.tolerance, rngs["machine"])
     poses = settings.stations
@@ -181,6 +243,7 @@ def draw_truth(
         )
         for T, pose in zip(T_camera_base, poses, strict=True)
     )
+    # configurations, board, noise of the readings
     T_base_platform, joints, images = _configurations(
         nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
     )
@@ -197,6 +260,7 @@ def draw_truth(
             rngs["board"],
         )
     noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
+    effects = TrueEffects.draw(nominal, settings.warming, len(joints), rngs["effects"])
     configurations = tuple(f"{k:04d}" for k in range(len(joints)))
     names = tuple(f"station{k + 1}" for k in range(len(poses)))
     if settings.handheld:
@@ -213,7 +277,7 @@ def draw_truth(
         rough=rough,
         T_base_platform=T_base_platform,
         joints=joints,
-        readings=joints + noise,
+        readings=effects.readings(machine, joints, T_base_platform) + noise,
         images=images,
         seed=seed,
         T_base_board=board if settings.board_on == "base" else None,
@@ -222,6 +286,7 @@ def draw_truth(
         focal_scale=1 + settings.breathing * rngs["focal"].standard_normal(len(poses))
         if settings.handheld
         else None,
+        effects=effects,
     )
 
 
@@ -243,10 +308,12 @@ def _configurations(
     n, repeats = settings.configurations, settings.repeats
     wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
+    # candidates that the nominal model reaches in the same assembly mode
     by_nominal = nominal.forward_result(joints)
     reached = by_nominal.converged & platform_unfolded(nominal, by_nominal.T_base_platform)
     reached &= same_mode(by_nominal.T_base_platform, poses)
     poses, joints = poses[reached], joints[reached]
+    # candidates in view of each group of stations, and the selection of each group
     in_view = np.stack(
         [
             in_picture(machine, camera, T, poses, joints)
@@ -270,6 +337,7 @@ def _configurations(
         taken[rows] = True
         chosen.append(rows)
     rows = _without_repeats(np.concatenate(chosen), groups, joints)
+    # pairs of station and configuration
     stations = range(len(cameras))
     if settings.handheld:
         pairs = [(s, s // repeats) for s in stations]
@@ -330,8 +398,9 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
     ``parameters`` are the true values by name; ``stations`` hold 4x4 ``T_camera_base``;
     ``configurations`` hold 4x4 ``T_base_platform`` and the exact readings ``joints``;
-    ``images`` are pairs of names, with ``repeats`` images of each (one by default). No
-    estimator reads this file.
+    ``images`` are pairs of names, with ``repeats`` images of each (one by default);
+    ``compliance``, ``temperature`` and ``growth`` are those of the readings. No estimator reads
+    this file.
     """
     names = truth.machine.parameters.names
     return {
@@ -364,7 +433,18 @@ def truth_document(truth: Truth) -> dict[str, Any]:
             else {"T_platform_board": truth.T_platform_board.tolist()}
         ),
         **({"repeats": truth.repeats} if truth.repeats > 1 else {}),
+        **_effects_document(truth.effects or TrueEffects()),
     }
+
+
+def _effects_document(effects: TrueEffects) -> dict[str, Any]:
+    """Fields of ``truth.json`` about effects on the readings, those that there are."""
+    fields: dict[str, Any] = {}
+    if effects.temperature is not None and effects.growth is not None:
+        fields = {"temperature": effects.temperature.tolist(), "growth": effects.growth.tolist()}
+    if effects.compliance is not None:
+        fields["compliance"] = effects.compliance
+    return fields
 
 
 def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
@@ -405,4 +485,8 @@ def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
         repeats=data.get("repeats", 1),
         T_platform_board=np.array(data["T_platform_board"]) if "T_platform_board" in data else None,
         focal_scale=np.array(focal) if focal else None,
+        effects=TrueEffects(
+            data.get("compliance"),
+            *(np.array(data[key]) if key in data else None for key in ("temperature", "growth")),
+        ),
     )

@@ -14,8 +14,8 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 
 SOLVER_ROWS_AT_ONCE = 2**15
-"""Rows in one call of NumPy, of several runs or of several configurations of one run: so many that
-the call costs little beside its arithmetic, and so few that they stay in the processor's cache."""
+"""Number of rows in one call of NumPy, of several runs or configurations: large compared with the
+overhead of a call, small enough for the processor's cache."""
 TALL_BLOCK_ROWS = 512
 """Rows of a block that is condensed by itself where there are many rows; with fewer unknowns than
 rows this takes a third of the time."""
@@ -43,8 +43,9 @@ class Linear(NamedTuple):
 class Reduced(NamedTuple):
     """Rows after elimination of the own unknowns.
 
-    rows : (B, K, r, na) reduced Jacobian. value : (B, K, r) residuals projected off the own
-    Jacobian. q, r : QR factors of the own Jacobian.
+    rows : (B, K, r, na) reduced Jacobian.
+    value : (B, K, r) residuals projected orthogonally to the own Jacobian.
+    q, r : QR factors of the own Jacobian.
     """
 
     rows: Array

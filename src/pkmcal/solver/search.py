@@ -91,7 +91,7 @@ class Values(NamedTuple):
 
 
 class LeastSquares(Protocol):
-    """Interface of a problem; the solver does not look into ``state``."""
+    """Interface of a problem; ``state`` is opaque to the solver."""
 
     def residuals(self, state: Any) -> Values:
         """Residuals at a state."""
@@ -190,8 +190,8 @@ def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
 class Solution:
     """Result of a search over B runs.
 
-    cost : where the last step was taken without a trial, the linear model's. normal : (B, na, na)
-    reduced normal matrix at the state before the last step.
+    cost : by the linear model where the last step was taken without a trial.
+    normal : (B, na, na) reduced normal matrix at the state before the last step.
     """
 
     state: Any
@@ -334,8 +334,9 @@ def _minimised(
 class _Search(NamedTuple):
     """State of the step control, (B,) each.
 
-    damping : of the next step. growth : factor on the damping if that step is refused. size : norm
-    of the last step's change of all residuals; infinite where it was damped or refused.
+    damping : of the next step.
+    growth : factor on the damping if that step is refused.
+    size : norm of the last step's change of all residuals; infinite where it was damped or refused.
     """
 
     damping: Array
@@ -376,7 +377,10 @@ class _Search(NamedTuple):
 
 
 class _Gain(NamedTuple):
-    """Result of a step. values : each part's residuals after it; None where it was not tried."""
+    """Result of a step.
+
+    values : residuals of each part after the step; None where it was not tried.
+    """
 
     accepted: Booleans
     values: list[Values] | None

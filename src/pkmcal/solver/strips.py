@@ -25,12 +25,16 @@ class StripLayout:
     """Indices of the rows and columns of N strips, the same for all runs.
 
     A strip is n rows of one configuration that depend on w of the shared unknowns, such as all
-    edges of one leg in one image. Strips with the same columns stand side by side.
+    edges of one leg in one image. Strips with the same columns are adjacent.
 
-    n_shared, n_own : na, d. configuration : (N,), of ``count``. rows : (N, n) which of the
-    configuration's each is, -1 for padding. groups : strips with the same columns. columns :
-    (groups, w), na where there are fewer. linked : (count, d) shared columns of each configuration
-    whose own unknowns are shared, -1 for the other configurations; None where there are none.
+    n_shared, n_own : na, d.
+    count : number of configurations, K.
+    configuration : (N,) of each strip.
+    rows : (N, n) number of each row in its configuration, -1 for padding.
+    groups : slices of the strips with the same columns.
+    columns : (groups, w) shared unknowns, na for padding.
+    linked : (K, d) shared columns of each configuration whose own unknowns are shared, -1 for the
+        other configurations; None where there are none.
     """
 
     n_shared: int

@@ -92,8 +92,10 @@ CALIBRATED_QUANTITIES: Mapping[str, Quantity] = {
 class SimulatedSessions:
     """Batch of simulated sessions, ready to be calibrated.
 
-    capture : their common plan. theta (B, P), poses T_base_platform (B, K, 4, 4), internal (B, K,
-    n) hinges : the truth. assembled : least-squares problem of all runs. start : initial state.
+    capture : the plan that all share.
+    theta, poses, internal : true parameters (B, P), T_base_platform (B, K, 4, 4), hinges (B, K, n).
+    assembled : least-squares problem of all runs.
+    start : initial state.
     """
 
     capture: Capture
@@ -264,10 +266,14 @@ def tool_error_and_sigma(
     """Errors of a calibrated machine's poses at given readings, and their stated standard
     deviations.
 
-    theta (P,), covariance (P, P) : of the result. joints : (W, m) readings. The frames of the truth
-    are registered to those of the result as in :func:`pkmcal.identify.tool.tool_error`; every : as
-    if no legs were observed. Returns two arrays (W, 6) of (omega, tau); NaN where a machine cannot
-    take the readings.
+    theta, covariance : (P,) and (P, P) of the result.
+    true : true state.
+    joints : (W, m) readings.
+    every : remove all frame changes, as if no legs were observed.
+
+    The frames of the truth are registered to those of the result as in
+    :func:`pkmcal.identify.tool.tool_error`. Returns two arrays (W, 6) of (omega, tau); NaN where a
+    machine cannot take the readings.
     """
     n = len(theta)
     # register the truth to the result rather than to the nominal model
@@ -333,11 +339,11 @@ def _truth(data: SimulatedSessions, run: int) -> State:
 def _machines(
     design: Design, capture: Capture, runs: int, rng: np.random.Generator
 ) -> tuple[Array, ForwardResult]:
-    """Draw true machines (B, P) by the prior sigmas, driven towards the plan's readings: their
-    poses (B, K, 4, 4) and their own readings (B, K, m).
+    """Draw true machines (B, P) by the prior sigmas, with the plan's readings as targets.
 
-    A machine that cannot take the readings is drawn again; ResultError after TIMES_MACHINES_REDRAWN
-    attempts.
+    Returns their parameters, and forward kinematics with poses (B, K, 4, 4) and each machine's own
+    readings (B, K, m). A machine that cannot take the readings is drawn again; ResultError after
+    TIMES_MACHINES_REDRAWN attempts.
     """
     machine, table = capture.machine, capture.machine.parameters
     tolerance, free = design.tolerance * table.tolerances_free(), table.free_matrix()
@@ -446,9 +452,10 @@ def _measured_edges(
 
 
 def _own_shading(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> Array:
-    """Individual shading of edges (n,), (runs, n) of unit variance.
+    """Shading of each edge in addition to its line's, (runs, n) of unit variance.
 
-    It is correlated between edges of the same line by the angle between their normals (n, 3).
+    Its correlation between edges of the same line follows from the angle between their normals (n,
+    3).
     """
     out = rng.standard_normal((runs, len(line)))
     for number in range(int(line.max(initial=-1)) + 1):

@@ -3,8 +3,8 @@ boards.
 
 Axes: S stations, K configurations, N edges, V views of a board with n corners each. The plan is
 made with the nominal model, as a user makes it; the true machines of a study, which differ by their
-prior sigmas, then take the same readings. Visibility is that of the plan: an edge of a true machine
-that is shorter by a millimetre counts with its planned length.
+prior sigmas, then take the same readings. Visibility is that of the plan: the edge of a true
+machine's shorter leg still has its planned length.
 """
 
 from __future__ import annotations
@@ -44,15 +44,21 @@ SPARE_CONFIGURATIONS_DRAWN = 10
 class Design:
     """Design of a machine with its measuring set-up; lengths in m, angles in rad.
 
-    machine : the nominal model. cameras : one for all stations, or one for each. stations : their
-    number. T_camera_base : (S, 4, 4) poses of the stations; None to choose them in every batch.
-    observe : legs, board or both; the board is on the platform. board : None for one in proportion
-    to the machine. configurations : number for each station; ``shared`` if all stations observe the
-    same ones. distance, elevation : of the cameras; None for the defaults. reading_noise : m or
-    rad. edge_noise : px, of an edge's shift and of its ends by tilt. corner_noise : px, of a
-    coordinate. shading : px, of the shift that all edges of a tube's side share at a station.
-    tolerance : standard deviation of true machines, in prior sigmas. extreme : share of
-    configurations with legs near the ends of their ranges.
+    machine : nominal model.
+    cameras : one for all stations, or one for each.
+    stations : number of stations.
+    T_camera_base : (S, 4, 4) poses of the stations; None to choose them in every batch.
+    observe : legs, board or both; the board is on the platform.
+    board : None for one in proportion to the machine.
+    configurations : number for each station.
+    shared : whether all stations observe the same configurations.
+    distance, elevation : of the cameras; None for the defaults.
+    reading_noise : standard deviation, m or rad.
+    edge_noise : standard deviation of an edge's shift, and of its ends by tilt, px.
+    corner_noise : standard deviation of a coordinate of a corner, px.
+    shading : standard deviation of the common shift of all edges of a tube's side at a station, px.
+    tolerance : standard deviation of true machines, in prior sigmas.
+    extreme : share of configurations with legs near the ends of their ranges.
     """
 
     machine: Machine
@@ -89,11 +95,14 @@ class Design:
 class Capture:
     """Plan of images by a design.
 
-    machine : the nominal model. cameras : one for each station. T_camera_base : (S, 4, 4).
-    T_base_platform (K, 4, 4), joints (K, m) : nominal and exact. edges : nominal and exact; empty
-    if legs are not observed. views : (V, 2) station and configuration of the images that show the
-    board. corners : (V, n) visibility of its corners. board, T_platform_board : None without a
-    board.
+    machine : nominal model.
+    cameras : one for each station.
+    T_camera_base : (S, 4, 4).
+    T_base_platform, joints : (K, 4, 4) and (K, m), nominal and exact.
+    edges : nominal and exact; empty if legs are not observed.
+    views : (V, 2) station and configuration of the images that contain the board.
+    corners : (V, n) visibility of its corners.
+    board, T_platform_board : None without a board.
     """
 
     machine: Machine

@@ -28,9 +28,11 @@ S = TypeVar("S", bound=StudySetting)
 class StudyResult(Generic[S]):
     """Results of all runs of one setting.
 
-    samples : of all runs, by key. accuracy : summaries of the quantities, each with its Monte-Carlo
-    error. wall : seconds of the whole study. solving : seconds of the estimators alone, divided by
-    the number of ``workers``. cpu : processor seconds of the estimators.
+    samples : of all runs, by key.
+    accuracy : summaries of the quantities, each with its Monte-Carlo error.
+    wall : duration of the whole study, s.
+    solving : duration of the estimators alone, divided by the number of ``workers``, s.
+    cpu : processor time of the estimators, s.
     """
 
     setting: S
@@ -68,8 +70,10 @@ def run_all(
 ) -> list[StudyResult[S]]:
     """Studies of several settings with the same seeds, so that they differ only by their settings.
 
-    runner : all cores of this machine by default. store : source of finished batches, and
-    destination of new ones as soon as they are done. names : of the settings, for error messages.
+    runner : all cores of this machine by default.
+    store : source of finished batches, and destination of new ones as soon as they are done.
+    names : of the settings, for error messages.
+
     Raises errors of the settings, with the setting's name.
     """
     began = time.perf_counter()

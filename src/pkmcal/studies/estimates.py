@@ -33,10 +33,12 @@ FREE_TOOL_FRAME_SIGMA = 1e3
 class Fitted:
     """Estimate of B runs.
 
-    theta : (B, P). T_camera_base, T_mount : (B, 4, 4) of the only station and the only mount. extra
-    : figures reported by the method, (B,) or (B, n) by name, such as chi2 per degree of freedom.
-    sigma : stated standard deviations, by quantity. covariance : (B, P, P) stated covariance of
-    theta, None if the method has none.
+    theta : (B, P).
+    T_camera_base, T_mount : (B, 4, 4) of the only station and the only mount.
+    extra : figures reported by the method, (B,) or (B, n) by name, such as chi2 per degree of
+        freedom.
+    sigma : stated standard deviations, by quantity.
+    covariance : (B, P, P) stated covariance of theta, None if the method has none.
     """
 
     theta: Array
@@ -54,7 +56,7 @@ def nominal_estimate(machine: Machine, runs: int) -> Fitted:
 
 
 def joint(problem: Problem, start: BatchState) -> BatchResult:
-    """Joint maximum-likelihood estimate with the true noise, which a simulation knows."""
+    """Joint maximum-likelihood estimate with the true noise levels of the simulation."""
     return solve_batch(problem, start, robust=False, scale_noise=False)
 
 

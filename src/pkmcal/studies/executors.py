@@ -87,13 +87,14 @@ def run_on(
 
 @contextmanager
 def _process_pool(count: int, tasks: Sequence[Job]) -> Generator[ProcessPoolExecutor]:
-    """Pool of new processes, which have all tasks and are killed where the block raises.
+    """Pool of new processes, which hold all tasks and are killed where the block raises.
 
     The tasks are no items of the pool's queue: where processes are killed while a long item is
     written, the shutdown of the pool hangs before Python 3.11.5.
 
     A new process runs the main module of its parent again, unless that module has no file. Batches
-    need nothing of it, so it is hidden, and a user's script needs no ``if __name__ == "__main__"``.
+    use nothing defined in the main module, so its file is hidden, and a user's script needs no ``if
+    __name__ == "__main__"``.
     """
     main, others = sys.modules["__main__"], set(active_children())
     sys.modules["__main__"] = ModuleType("__main__")

@@ -39,14 +39,19 @@ COVERAGE_INTERVALS = np.array([0.5, 0.68, 0.8, 0.9, 0.95, 0.99])
 class CellFindings:
     """Summary of the runs of one combination.
 
-    runs : their number. freedom : degrees of freedom of the standard errors; less than one if fewer
-    than two runs are usable. failed : share of runs that did not converge or had to be refused.
-    position (m) and orientation (rad) : root mean square of the tool's error over the workspace;
-    ``_95`` : its 95th percentile; ``_sigma`` : mean of the stated standard deviation. covered,
-    covered_tool : share of 95 % intervals that contain the truth, for the parameters and for the
-    tool's pose. held, held_tool : (n,) the same for the intervals of COVERAGE_INTERVALS. chi2 : per
-    degree of freedom. parameters : (P,) names. by_parameter : (P,) coverage of each parameter's 95
-    % intervals; NaN for those without a standard deviation.
+    runs : number of runs.
+    freedom : degrees of freedom of the standard errors; less than one if fewer than two runs are
+        usable.
+    failed : share of runs that did not converge or had to be refused.
+    position, orientation : root mean square of the tool's error over the workspace, m and rad; with
+        ``_95`` its 95th percentile, with ``_sigma`` the mean of the stated standard deviation.
+    covered, covered_tool : share of 95 % intervals that contain the truth, for the parameters and
+        for the tool's pose.
+    held, held_tool : (n,) the same for the intervals of COVERAGE_INTERVALS.
+    chi2 : per degree of freedom.
+    parameters : (P,) names.
+    by_parameter : (P,) coverage of each parameter's 95 % intervals; NaN for those without a
+        standard deviation.
     """
 
     values: Mapping[str, Value]
@@ -71,8 +76,10 @@ class CellFindings:
 
     @property
     def honest(self) -> bool | None:
-        """Whether the coverage of 95 % intervals is at least 93 %, within Student's two-sided 95 %
-        limit of its Monte-Carlo error; None if fewer than two runs are usable.
+        """Whether the coverage of 95 % intervals is at least 93 %, within its Monte-Carlo error.
+
+        The limit of the error is Student's two-sided 95 % limit. None if fewer than two runs are
+        usable.
         """
         from scipy.special import stdtrit
 
@@ -109,8 +116,11 @@ class Gain(NamedTuple):
 class SweepResult:
     """Result of a study.
 
-    subject : what was studied. varied : names with their values. cells, results : combinations and
-    their runs. found : their summaries. runs : number for each combination.
+    subject : what was studied.
+    varied : names with their values.
+    cells, results : combinations and their runs.
+    found : summaries of the combinations.
+    runs : number of runs for each combination.
     """
 
     subject: StudySubject

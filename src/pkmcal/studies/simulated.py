@@ -26,7 +26,9 @@ from pkmcal.mechanisms.closure import limb_ends
 class Viewpoints:
     """Stations and what they observe of K configurations, the same in all runs.
 
-    T_camera_base : (S, 4, 4). station : (K,). legs : (K, G) legs whose axes are observed.
+    T_camera_base : (S, 4, 4).
+    station : (K,).
+    legs : (K, G) legs whose axes are observed.
     T_platform_board : (4, 4), None without a board.
     """
 
@@ -40,8 +42,9 @@ class Viewpoints:
 class Noise:
     """Standard deviations of the measurements.
 
-    reading : m or rad; errors are uniform if ``even``, else normal. axis : (4,) of an axis's psi,
-    theta, x and z. pose : (6,) of a board's (omega, tau).
+    reading : m or rad; errors are uniform if ``even``, else normal.
+    axis : (4,) of an axis's psi, theta, x and z.
+    pose : (6,) of a board's (omega, tau).
     """
 
     reading: float
@@ -54,10 +57,13 @@ class Noise:
 class SimulatedRuns:
     """Simulated runs with their truth.
 
-    machine : model of the truth. theta : (B, P). T_base_platform : (B, K, 4, 4) true. joints : (B,
-    K, m) measured. axis : (B, K, G, 4) measured. T_camera_board : (B, K, 4, 4) measured; (B, 0, 4,
-    4) without a board. control : number of configurations at the end that are held out from the
-    calibration.
+    machine : model of the truth.
+    theta : (B, P).
+    T_base_platform : (B, K, 4, 4) true.
+    joints : (B, K, m) measured.
+    axis : (B, K, G, 4) measured.
+    T_camera_board : (B, K, 4, 4) measured; (B, 0, 4, 4) without a board.
+    control : number of configurations at the end that are held out from the calibration.
     """
 
     machine: Machine

@@ -50,11 +50,11 @@ MOST_LINES = 8
 MOST_TICKS = 8
 """Maximum number of values that are ticks of an axis; beyond it, the axis chooses its ticks."""
 LEAST_NUMBERS = 3
-"""Number of values from which on they are places on a scale, and are joined by lines."""
+"""Smallest number of values that are plotted on a numerical axis and joined by lines."""
 LOG_AXIS_RATIO = 8.0
-"""Ratio of the largest to the smallest value from which on the axis is logarithmic."""
+"""Ratio of the largest to the smallest value above which the axis is logarithmic."""
 MANY_FAILED = 0.1
-"""Share of failed runs from which a combination is reported."""
+"""Share of failed runs above which a combination is reported."""
 STUDY_METHOD_TEXT = (
     "Each run draws a machine from the nominal model's tolerances, measures it with the noise"
     " that is stated, and calibrates it as pkmcal calibrate does: from the nominal model,"
@@ -327,8 +327,10 @@ def _groups(study: SweepResult, name: str) -> Iterator[tuple[str, list[CellFindi
 
 
 def _curves(study: SweepResult) -> list[Plot]:
-    """Plots of the tool's error and its stated standard deviation along the names, those with most
-    values first; a name whose combinations a plot before it shows has none.
+    """Plots of the tool's error and its stated standard deviation along the varied names.
+
+    Names with the most values come first; a name whose combinations are part of an earlier plot has
+    no plot of its own.
     """
     out: list[Plot] = []
     several = [name for name, values in study.varied.items() if len(values) > 1]

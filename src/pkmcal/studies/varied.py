@@ -14,8 +14,11 @@ from dataclasses import dataclass
 class Varied:
     """Name that can be varied.
 
-    cell_text : description. least, most : limits of its numbers. whole : integers only. unit : of
-    its numbers. words : its values if they are not numbers.
+    cell_text : description.
+    least, most : limits of its numbers.
+    whole : integers only.
+    unit : of its numbers.
+    words : its values if they are not numbers.
     """
 
     cell_text: str

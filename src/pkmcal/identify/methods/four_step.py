@@ -80,10 +80,12 @@ class FourSteps:
     """Results of the steps; the frames of a spatial machine are those of three centres.
 
     base, platform : (B, L, 3) m, the latter NaN for passive legs that are unidentifiable.
-    offsets : (B, L) m, zero for passive legs. T_camera_base : (B, S, 4, 4). base_axes,
-    platform_axes : (B, L, 3) unit, NaN where the machine has none; nominal where unidentifiable.
-    T_base_platform : (B, K, 4, 4) of the configurations ``configuration`` (K,). posed : (K,)
-    whether enough legs with a length were seen together for that pose.
+    offsets : (B, L) m, zero for passive legs.
+    T_camera_base : (B, S, 4, 4).
+    base_axes, platform_axes : (B, L, 3) unit, NaN where the machine has none; nominal where
+        unidentifiable.
+    T_base_platform : (B, K, 4, 4) of the configurations ``configuration`` (K,).
+    posed : (K,) whether enough legs with a length were seen together for that pose.
     """
 
     base: Array

@@ -176,7 +176,9 @@ def with_boards(
 class Base(NamedTuple):
     """Joints of the base in its own frame, and the poses of the views.
 
-    centres : (B, L, 3) m. directions : (B, D, 3) unit. T_view_base : (B, V, 4, 4).
+    centres : (B, L, 3) m.
+    directions : (B, D, 3) unit.
+    T_view_base : (B, V, 4, 4).
     """
 
     centres: Array
@@ -187,8 +189,9 @@ class Base(NamedTuple):
 class Items(NamedTuple):
     """Items of the base in V views, and their nominal values.
 
-    centres : (B, V, L, 3) m, visible (V, L). directions : (B, V, D, 3) unit, visible (V, D). drawn,
-    drawn_directions : (L, 3) and (D, 3) of the nominal model.
+    centres : (B, V, L, 3) m, visible (V, L).
+    directions : (B, V, D, 3) unit, visible (V, D).
+    drawn, drawn_directions : (L, 3) and (D, 3) of the nominal model.
     """
 
     centres: Array

@@ -40,8 +40,9 @@ ROUNDED_INFORMATION_SHARE = 1e-12
 def joint_distance_offsets(axes: Axes, a_photo: Array, start: Array, form: str) -> Array:
     """Step 3, [A] 13-14: offsets (B, L) for constant distances between platform joints.
 
-    axes : only legs with a length are visible. a_photo : (B, C, L, 3) base centres in each image's
-    frame. start : (L,) m, nominal; a length of zero is a false minimum.
+    axes : only legs with a length are visible.
+    a_photo : (B, C, L, 3) base centres in each image's frame.
+    start : (L,) m, nominal; a length of zero is a false minimum.
     """
 
     def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
@@ -163,8 +164,10 @@ def passive_centres(
 def torsion(u: Array, rot: Array, v: Array, w: Array) -> tuple[Array, Array, Array]:
     """Twist u . (v x R w) of a universal-universal leg (errata, 3-UPU), and derivatives by v and w.
 
-    u : (..., 3) leg. v : (..., 3) first axis on the base, w : on the platform. rot : (..., 3, 3)
-    from platform to base. Zero on the machine: two universal joints of one leg cannot twist.
+    u : (..., 3) leg.
+    v : (..., 3) first axis on the base, w : on the platform.
+    rot : (..., 3, 3) from platform to base. Zero on the machine: two universal joints of one leg
+        cannot twist.
     """
     turned = (rot @ w[..., None])[..., 0]
     by_v = cross(turned, u)
@@ -181,9 +184,13 @@ def universal_axes(
     as a prior: unidentifiable directions stay nominal. One of a leg's four degrees of freedom, a
     common rotation of both axes, is unidentifiable where the platform does not rotate, as on a
     3-UPU. The torsion's noise is estimated from the residuals of a fit with a weak prior, so that
-    the data decide where they are more accurate. u : (B, K, L, 3) base frame. rot : (B, K, 3, 3)
-    platform to base. visible : (K, L). drawn : nominal axes v, w (B, L, 3). tolerance : (L,).
-    Returns v, w (B, L, 3) unit.
+    the data decide where they are more accurate.
+
+    u : (B, K, L, 3) base frame.
+    rot : (B, K, 3, 3) platform to base.
+    visible : (K, L).
+    drawn : nominal axes v, w (B, L, 3).
+    tolerance : (L,). Returns v, w (B, L, 3) unit.
     """
 
     def rows(x: Array) -> tuple[Array, Array]:

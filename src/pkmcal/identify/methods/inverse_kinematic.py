@@ -56,7 +56,10 @@ PLACEMENT_PRIOR_SIGMA = 0.1
 class ImplicitState(NamedTuple):
     """Unknowns of B runs.
 
-    z : (B, nz). T_camera_base : (B, S, 4, 4). T_mount : (B, M, 4, 4). internal : (B, N, n).
+    z : (B, nz).
+    T_camera_base : (B, S, 4, 4).
+    T_mount : (B, M, 4, 4).
+    internal : (B, N, n).
     """
 
     z: Array
@@ -89,9 +92,13 @@ class _Rows(NamedTuple):
 class ImplicitProblem:
     """solver.LeastSquares of B runs with N poses each; stations' unknowns perturb T_base_camera.
 
-    layout, nominal model (P,), free (P, nz) : the machine. station, mount : (N,), of n_stations and
-    n_mounts. T_camera_board : (B, N, 4, 4) and readings : (B, N, m). form : see the module.
-    weigh : (B, N, r, r) of the rows, constant during the search. prior : (c, nz) rows on z.
+    layout, nominal model (P,), free (P, nz) : the machine.
+
+    station, mount : (N,), of n_stations and n_mounts.
+    T_camera_board : (B, N, 4, 4) and readings : (B, N, m).
+    form : see the module.
+    weigh : (B, N, r, r) of the rows, constant during the search.
+    prior : (c, nz) rows on z.
     keep : (na,) False for fixed unknowns.
 
     Jacobian of one pose (own columns are eliminated by the Schur complement):
@@ -238,8 +245,9 @@ def _placed(values: Array, which: Array) -> Array:
 class PoseFit:
     """Result of the method on B runs.
 
-    problem : with the final weights and fixed unknowns. solution : its state, cost, stops. rank :
-    of the Jacobian with all unknowns free.
+    problem : with the final weights and fixed unknowns.
+    solution : its state, cost, stops.
+    rank : of the Jacobian with all unknowns free.
     """
 
     problem: ImplicitProblem
@@ -295,9 +303,11 @@ def pose_problem(
 ) -> tuple[ImplicitProblem, ImplicitState]:
     """Unweighted problem of B runs with the measurements' stations and mounts, and its start.
 
-    T_camera_board : (B, N, 4, 4). readings : (B, N, m). start : of one run, or with a leading axis
-    B on ``T_camera_base`` and ``T_mount``. Raises InputError for the joint form on a machine with
-    several rods on a motor.
+    T_camera_board : (B, N, 4, 4).
+    readings : (B, N, m).
+    start : of one run, or with a leading axis B on ``T_camera_base`` and ``T_mount``.
+
+    Raises InputError for the joint form on a machine with several rods on a motor.
     """
     layout, table = machine.layout, machine.parameters
     if form == "joint" and layout.shares_motors:

@@ -34,10 +34,12 @@ each other, where noise dominates."""
 class Axes:
     """Leg axes from images, camera frame.
 
-    station, configuration : (C,) of each image. visible : (C, L). u, point : (B, C, L, 3) direction
-    from A to B, and any point of the axis (m). readings : (B, C, L). information : (B, C, L, 3, 3)
-    information of each direction up to a common factor, used where several images show the same
-    leg; None for equal weights.
+    station, configuration : (C,) of each image.
+    visible : (C, L).
+    u, point : (B, C, L, 3) direction from A to B, and any point of the axis (m).
+    readings : (B, C, L).
+    information : (B, C, L, 3, 3) information of each direction up to a common factor, used where
+        several images show the same leg; None for equal weights.
     """
 
     station: Integers

@@ -42,7 +42,8 @@ class LinearCentres:
     """Base centres in the camera frames, [B] 14.
 
     centres : (S, L, 3) m, NaN where a leg was not seen in enough directions.
-    covariance : (S, L, 3, 3). weights : (N,) of the edges.
+    covariance : (S, L, 3, 3).
+    weights : (N,) of the edges.
     """
 
     centres: Array

@@ -59,10 +59,14 @@ FULL_WEIGHT_DISTANCE."""
 class BaseSolution:
     """Joint solution of the edges with the nominal model.
 
-    theta : (P,) all parameters; those without edges are nominal. T_camera_base : (S, 4, 4).
+    theta : (P,) all parameters; those without edges are nominal.
+    T_camera_base : (S, 4, 4).
     spread : (P + 6 S, m) square root of the covariance of parameters and stations (omega, tau), in
-    theta's frames. edge_shift, edge_shift_sigma : (C,) px. shading : (n,) px, standard deviation of
-    each line's own shift. weights : (N,) of the edges. scale : factor on the edges' stated noise.
+        theta's frames.
+    edge_shift, edge_shift_sigma : (C,) px.
+    shading : (n,) px, standard deviation of each line's own shift.
+    weights : (N,) of the edges.
+    scale : factor on the edges' stated noise.
     """
 
     theta: Array
@@ -131,7 +135,8 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
 class _State(NamedTuple):
     """State of the iteration.
 
-    z : (nz,) deviations of the free parameters from the nominal model. T_camera_base : (S, 4, 4).
+    z : (nz,) deviations of the free parameters from the nominal model.
+    T_camera_base : (S, 4, 4).
     shifts : (C + n,) px outward, of cameras and then of lines.
     """
 
@@ -150,10 +155,12 @@ class _State(NamedTuple):
 class _System:
     """Constant data of [B] 14: N edges and their columns among parameters and unknowns.
 
-    centre, radius : (N, 3) and (N,) columns of theta. shifts : (N, 1 or 2) columns of each edge's
-    shifts. noise : (N, 3, 3) covariances of the normals. by_shift : (N, 3) their derivatives by an
-    outward shift, per px. used : (N,) edges of legs that their station determines. start : the
-    first state.
+    centre, radius : (N, 3) and (N,) columns of theta.
+    shifts : (N, 1 or 2) columns of each edge's shifts.
+    noise : (N, 3, 3) covariances of the normals.
+    by_shift : (N, 3) their derivatives by an outward shift, per px.
+    used : (N,) edges of legs that their station determines.
+    start : the first state.
     """
 
     machine: Machine
@@ -313,8 +320,11 @@ def _solved(
 ) -> tuple[_State, Array]:
     """Solution for given variances, and a square root (na, na) of its covariance.
 
-    weight : (N,) of the edges. scale : of their noise. shading : (n,) px of the lines. Raises
-    ResultError if the Gauss-Newton steps do not converge.
+    weight : (N,) of the edges.
+    scale : of their noise.
+    shading : (n,) px of the lines.
+
+    Raises ResultError if the Gauss-Newton steps do not converge.
     """
     u, prior = system.unknowns, system.prior(shading)
     beliefs = np.zeros((len(prior), u.count))

@@ -44,8 +44,10 @@ class RegisteredBody(NamedTuple):
 class BodyProblem:
     """solver.LeastSquares for a rigid body; measured (B, K, n, 3), weight (B, K, n).
 
-    gauge : (c, 3 n) rows that fix the body's frame. nominal : (n, 3) their reference. shifts : (n,)
-    1 for points, 0 for directions. motion : (6, d) of the body.
+    gauge : (c, 3 n) rows that fix the body's frame.
+    nominal : (n, 3) their reference.
+    shifts : (n,) 1 for points, 0 for directions.
+    motion : (6, d) of the body.
 
     Jacobian of frame k (own columns are eliminated by the Schur complement):
 
@@ -117,10 +119,13 @@ def fit_body(
 ) -> RegisteredBody:
     """Body and its poses by registration; [A] 9 and 16 corrected.
 
-    measured : (B, K, n, 3) m. weight : (B, K, n), 0 where not visible; frames that leave their pose
-    undetermined (fewer than three points of a spatial body) must be removed. gauge : (c, 3 n) rows
-    on the items. nominal : (n, 3) m, the start. directions : number of the last items that are
-    directions. motion : (6, d) of the body in its frames.
+    measured : (B, K, n, 3) m.
+    weight : (B, K, n), 0 where not visible; frames that leave their pose undetermined (fewer than
+        three points of a spatial body) must be removed.
+    gauge : (c, 3 n) rows on the items.
+    nominal : (n, 3) m, the start.
+    directions : number of the last items that are directions.
+    motion : (6, d) of the body in its frames.
     """
     measured = np.where(weight[..., None] > 0, measured, 0.0)
     points = np.broadcast_to(nominal, (measured.shape[0], *nominal.shape)).copy()
@@ -283,8 +288,9 @@ def points_by(
 ) -> Array:
     """Points (B, n, 3) that minimize a criterion.
 
-    gauge : (c, 3 n) rows that fix the points' frame. criterion : function of points (b, n, 3) and
-    the runs' indices (b,), with values (b, r) in m (or m^2) and their derivatives (b, r, n, 3).
+    gauge : (c, 3 n) rows that fix the points' frame.
+    criterion : function of points (b, n, 3) and the runs' indices (b,), with values (b, r) in m (or
+        m^2) and their derivatives (b, r, n, 3).
     nominal : (n, 3), the start.
     """
 

@@ -1,19 +1,21 @@
 """Joint at a limb's end as stated in the file: a centre, possibly with an axis.
 
 A spherical joint has a centre. A universal joint has its first axis, fixed to the body it is
-mounted on. A revolute joint has one axis, about which the limb rotates. The joint is on the base
-and not moved by the reading, or on a platform that is one rigid body.
+mounted on, and may have its second axis at an offset from it. A revolute joint has one axis, about
+which the limb rotates. The joint is on the base and not moved by the reading, or on a platform that
+is one rigid body.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, final
+from typing import Annotated, Any, ClassVar, Literal, final
 
 import numpy as np
+from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Point, Schema
+from pkmcal.files import Metres, Point, Schema
 from pkmcal.geometry.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
     AxisRole,
@@ -33,6 +35,14 @@ class JointDocument(Schema):
     joint: Literal["spherical", "universal", "revolute"]
     center: Point
     axis: Direction | None = None
+    offset: (
+        Annotated[
+            Metres,
+            Field(ge=-1, le=1, description="the distance of a universal joint's second axis from"
+                  " its first one, such as 12 mm, positive towards the leg's other end"),
+        ]
+        | None
+    ) = None  # fmt: skip
 
 
 class JointEnd(Carrier):
@@ -60,16 +70,23 @@ class JointEnd(Carrier):
                 expected=f"axis: [x, y, z] in the {site.side} frame, the direction that it turns"
                 " about",
             )
+        if node.offset is not None and (node.joint != "universal" or node.axis is None):
+            raise InputError(
+                f"leg {site.leg} has an offset of a joint's axes, but no two axes",
+                where=site.where("offset"),
+                expected="joint: universal with axis: [x, y, z], its first one",
+            )
         super().check(node, site)
 
     @staticmethod
     def axis_role(node: Any) -> AxisRole | None:
         """Square for a revolute joint, whose limb is orthogonal to the axis; twist for a universal
-        joint with an axis.
+        joint with an axis and no offset.
         """
         if node.joint == "revolute":
             return "square"
-        return "twist" if node.joint == "universal" and node.axis is not None else None
+        meets = node.joint == "universal" and node.axis is not None and node.offset is None
+        return "twist" if meets else None
 
     @staticmethod
     def chain(parameters: Array) -> Chain:

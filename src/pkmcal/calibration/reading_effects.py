@@ -1,0 +1,164 @@
+"""Effects on the readings that a mechanism file or a session states: sag under a load, thermal
+growth.
+
+An effect has k coefficients with a prior: the compliance of the drives relative to what the file
+states, the growth of drives and frame per kelvin (:mod:`pkmcal.mechanisms.disturbances`). What its
+mean does to the readings is a known correction, and what is left of the coefficients are unknowns
+of the estimate, with a column each (:mod:`pkmcal.measurements.columns`). The calibrated machine's
+file states the estimated coefficients, so that they apply to its later sessions.
+
+Forces and growth are those of a machine at its poses: of the nominal one at the readings, which is
+right to first order, then of an estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, short_repr
+from pkmcal.identify.estimate import Estimate
+from pkmcal.measurements import Column, Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.disturbances import (
+    compliance,
+    growth_by_readings,
+    growth_of,
+    sag,
+    tool_shift,
+)
+from pkmcal.mechanisms.document import STEEL_EXPANSION, STIFFNESS_TOLERANCE, Growth
+from pkmcal.outcome.finding import Finding, note
+from pkmcal.session.load import Session
+
+THERMAL_GROWTH, COMPLIANCE = "readings.growth", "machine.compliance"
+
+
+@dataclass(frozen=True)
+class ReadingEffect:
+    """Effect of k coefficients on the readings.
+
+    code : of its column. by : (K, m, k) change of the readings by the coefficients. mean : (k,),
+    root : (k, k) square root of their prior covariance.
+    """
+
+    code: str
+    by: Array
+    mean: Array
+    root: Array
+
+    __repr__ = short_repr
+
+    @property
+    def correction(self) -> Array:
+        """What the mean does to the readings, (K, m)."""
+        return self.by @ self.mean
+
+    def __call__(self, measurements: Measurements) -> Iterator[Column]:
+        """Column of what is left of the coefficients."""
+        del measurements
+        yield Column(self.code, readings=self.by, prior=self.root)
+
+    def estimated(self, estimate: Estimate) -> tuple[Array, Array]:
+        """Coefficients (k,) of an estimate and their covariance (k, k); the prior's of an estimate
+        without them.
+        """
+        if self.code not in estimate.column_covariance:
+            return self.mean, self.root @ self.root.T
+        return (
+            self.mean + estimate.state.columns[self.code],
+            estimate.column_covariance[self.code],
+        )
+
+
+def reading_effects(
+    machine: Machine, joints: Array, poses: Array, temperature: Array | None
+) -> tuple[ReadingEffect, ...]:
+    """Effects on the readings joints (K, m) at poses (K, 4, 4) and temperatures (K,), if any."""
+    out: list[ReadingEffect] = []
+    if compliance(machine) is not None:
+        root = np.full((1, 1), machine.document.tolerance.stiffness or STIFFNESS_TOLERANCE)
+        out.append(ReadingEffect(COMPLIANCE, sag(machine, poses)[..., None], np.ones(1), root))
+    if temperature is not None:
+        growth = growth_of(machine, temperature)
+        warmer = (temperature - growth.temperature)[:, None, None]
+        mutual = np.array([[1.0, growth.correlation], [growth.correlation, 1.0]])
+        out.append(
+            ReadingEffect(
+                THERMAL_GROWTH,
+                warmer * growth_by_readings(machine, joints, poses),
+                np.array([growth.drives, growth.frame]),
+                np.diag(growth.sigma) @ np.linalg.cholesky(mutual),
+            )
+        )
+    return tuple(out)
+
+
+def effects_of_session(
+    session: Session, estimate: Estimate | None = None
+) -> tuple[ReadingEffect, ...]:
+    """Effects on a session's readings, by the nominal machine or by an earlier estimate."""
+    if session.temperature is None and compliance(session.machine) is None:
+        return ()  # kinematics may fail, or take their time
+    machine, poses = session.machine, session.forward.T_base_platform
+    if estimate is not None:
+        machine, poses = estimate.machine, estimate.state.T_base_platform
+    return reading_effects(machine, session.joints, poses, session.temperature)
+
+
+def with_estimated_effects(session: Session, estimate: Estimate) -> Estimate:
+    """The estimate, whose machine's file states the estimated coefficients."""
+    document = estimate.machine.document
+    for effect in effects_of_session(session):
+        value, covariance = effect.estimated(estimate)
+        sigma = np.sqrt(np.diag(covariance))
+        if effect.code == COMPLIANCE and value[0] > 0:
+            legs = tuple(
+                leg.model_copy(update={"stiffness": leg.stiffness and leg.stiffness / value[0]})
+                for leg in document.legs
+            )
+            tolerance = document.tolerance.model_copy(
+                update={"stiffness": float(sigma[0] / value[0])}
+            )
+            document = document.model_copy(update={"legs": legs, "tolerance": tolerance})
+        if effect.code == THERMAL_GROWTH and session.temperature is not None:
+            growth = Growth(
+                temperature=growth_of(session.machine, session.temperature).temperature,
+                drives=value[0],
+                frame=value[1],
+                sigma=tuple(sigma),
+                correlation=covariance[0, 1] / (sigma[0] * sigma[1]),
+            )
+            document = document.model_copy(update={"growth": growth})
+    return replace(estimate, machine=replace(estimate.machine, document=document))
+
+
+def effect_notes(session: Session, estimate: Estimate) -> Iterator[Finding]:
+    """Notes on the estimated coefficients."""
+    document, used = session.machine.document, estimate.configurations
+    for effect in effects_of_session(session):
+        value, covariance = effect.estimated(estimate)
+        sigma = np.sqrt(np.diag(covariance))
+        if effect.code == COMPLIANCE and document.load is not None:
+            poses = estimate.state.T_base_platform[used]
+            shift = tool_shift(estimate.machine, poses, value[0] * sag(session.machine, poses))
+            yield note(
+                "machine.compliance",
+                value=float(value[0]),
+                sigma=float(sigma[0]),
+                prior=float(effect.root[0, 0]),
+                mass=document.load.mass,
+                tool_shift=float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1)))),
+            )
+        if effect.code == THERMAL_GROWTH and session.temperature is not None:
+            yield note(
+                "readings.growth",
+                mean=growth_of(session.machine, session.temperature).temperature,
+                steel=None if document.growth else 1e6 * STEEL_EXPANSION,
+                drives=1e6 * float(value[0]),
+                sigma_drives=1e6 * float(sigma[0]),
+                frame=1e6 * float(value[1]),
+                sigma_frame=1e6 * float(sigma[1]),
+            )

@@ -1,0 +1,169 @@
+"""Universal joints whose axes do not meet by design: closure, exports, calibration, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from export_sources import source_of
+from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.errors import InputError
+from pkmcal.exporters.contract import make_export
+from pkmcal.exporters.samples import samples
+from pkmcal.files import yaml_text
+from pkmcal.geometry.rigid import perturb
+from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.mechanisms.closure import closure, dense
+from screw_hexapod import screw_hexapod
+from test_kinematics import differences
+from test_pose_sessions import make, write_joints
+
+OFFSETS = {"both": (0.012, 0.009), "base": (0.012, None), "platform": (None, -0.01)}
+
+
+def offset_fields(base, platform, tubes=False):
+    """Fields of a hexapod whose joints' second axes lie at offsets, m, from their first ones."""
+    fields = screw_hexapod(0.0).to_document()
+    for leg in fields["legs"]:
+        del leg["length"]["lead"]
+        for end, offset in (("base", base), ("platform", platform)):
+            if offset is None:
+                del leg[end]["axis"]
+            else:
+                leg[end]["offset"] = offset
+        if not tubes:
+            leg["tubes"] = []
+    return fields
+
+
+def hexapod(folder, *offsets):
+    path = folder / "offset.yaml"
+    path.write_text(yaml_text(offset_fields(*offsets)))
+    return path
+
+
+@pytest.fixture(params=OFFSETS)
+def machine(request, tmp_path):
+    """Parameters off their nominal values, axes of another length than 1 too."""
+    nominal = load_mechanism(hexapod(tmp_path, *OFFSETS[request.param]))
+    rng = np.random.default_rng(1)
+    return nominal.with_values(nominal.values + 0.005 * rng.normal(size=len(nominal.values)))
+
+
+def rod_between(T, leg):
+    """Length of a leg's rod, m, by the angles of both joints: the second axis of each turns about
+    its first one, and the rod is square to both second axes.
+    """
+    bodies = {"base": (np.eye(3), np.zeros(3)), "platform": (T[:3, :3], T[:3, 3])}
+    joints = []
+    for end, (turn, place) in bodies.items():
+        axis = turn @ leg[end].get("axis", [1.0, 0.0, 0.0])
+        axis = axis / np.linalg.norm(axis)
+        joints.append((turn @ leg[end]["center"] + place, axis, leg[end].get("offset", 0.0)))
+    toward = joints[1][0] - joints[0][0]
+
+    def ends(angles):
+        out = []
+        for (center, axis, offset), sign, angle in zip(joints, (1, -1), angles, strict=True):
+            ahead = sign * (toward - (toward @ axis) * axis)
+            ahead = Rotation.from_rotvec(angle * axis).apply(ahead / np.linalg.norm(ahead))
+            out.append((center + offset * ahead, np.cross(axis, ahead)))
+        return out
+
+    def slant(angles):
+        (a, first), (b, second) = ends(angles)
+        return [(b - a) @ first, (b - a) @ second]
+
+    solved = least_squares(slant, [0.0, 0.0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    (a, _), (b, _) = ends(solved.x)
+    return np.linalg.norm(b - a)
+
+
+def test_readings_are_those_of_rods_square_to_both_axes(machine):
+    document = machine.to_document()
+    shares = []
+    for T, readings in zip(*samples(machine, 8), strict=True):
+        for leg, reading in zip(document["legs"], readings, strict=True):
+            length = leg["scale"] * reading + leg["length"]["offset"]
+            assert length == pytest.approx(rod_between(T, leg), abs=1e-12)
+            a, b = (np.array(leg[end]["center"]) for end in ("base", "platform"))
+            shares.append(length - np.linalg.norm(T[:3, :3] @ b + T[:3, 3] - a))
+    assert np.ptp(shares) > 1e-4  # no mere change of the rods' offsets
+
+
+@pytest.mark.parametrize("k", range(2))
+def test_derivatives(machine, k):
+    layout, theta = machine.layout, machine.values
+    T, q = (values[k] for values in samples(machine, 3))
+    c = closure(layout, theta, q, T)
+    by_pose = differences(lambda d: closure(layout, theta, q, perturb(T, d)).rows.value, 6, 1e-3)
+    np.testing.assert_allclose(c.rows.by_pose, by_pose, atol=1e-10)
+    count = len(theta)
+    by_theta = differences(lambda d: closure(layout, theta + d, q, T).rows.value, count, 1e-3)
+    np.testing.assert_allclose(dense(c, count), by_theta, atol=1e-10)
+
+
+def test_poses_come_back(machine):
+    poses, readings = samples(machine, 20)
+    near = perturb(poses, 0.02 * np.random.default_rng(2).normal(size=(len(poses), 6)))
+    result = machine.forward_result(readings, near)
+    assert result.converged.all()
+    np.testing.assert_allclose(result.T_base_platform, poses, atol=1e-10)
+
+
+def test_the_file_has_the_offsets(machine, tmp_path):
+    path = tmp_path / "again.yaml"
+    path.write_text(mechanism_text(machine))
+    poses, readings = samples(machine, 5)
+    np.testing.assert_allclose(load_mechanism(path).inverse(poses), readings, atol=1e-12)
+
+
+@pytest.mark.parametrize(("to", "noted"), [("c", True), ("mujoco", True), ("yaml", False)])
+def test_a_format_with_one_centre_is_noted(to, noted, tmp_path):
+    nominal = load_mechanism(hexapod(tmp_path, *OFFSETS["both"]))
+    notes = make_export(source_of(nominal), to).notes
+    notes = [one for one in notes if one.code == "export.without_joint_offsets"]
+    assert bool(notes) == noted
+    for note in notes:
+        # less than the offsets, for the rods' offsets take their mean
+        assert 1e-5 < note.facts["largest"] < 2e-3
+
+
+def test_calibration_knows_the_offsets(tmp_path):
+    """With them there is nothing to name; without them the joints' axes are named."""
+    path = hexapod(tmp_path, *OFFSETS["both"])
+    made = make(tmp_path / "session", path, n=40)
+    result = calibrate_session(made.folder)
+    assert result.verdict.usable
+    assert not result.violations
+    # one joint of another offset than stated
+    fields = made.machine.to_document()
+    fields["legs"][2]["base"]["offset"] += 3e-3
+    (tmp_path / "true.yaml").write_text(yaml_text(fields))
+    true, readings = load_mechanism(tmp_path / "true.yaml"), made.joints.copy()
+    readings += true.inverse(made.T) - made.machine.inverse(made.T)
+    write_joints(made.folder, readings)
+    (one,) = calibrate_session(made.folder).violations
+    assert (one.code, one.of) == ("machine.joint_offset", "leg 3")
+    facts = one.finding.facts
+    assert facts["value"] == pytest.approx(0.015, abs=4 * facts["sigma"])
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (lambda leg: leg["base"].pop("axis"), "legs[2].base.offset"),
+        (lambda leg: leg["length"].update(lead=0.005), "legs[2].length.lead"),
+        (lambda leg: leg.update(tubes=[{"radius": 0.01, "from": 0.1, "to": 0.2}]), "legs[2].tubes"),
+    ],
+)
+def test_what_offset_joints_exclude_is_refused(change, field, tmp_path):
+    fields = offset_fields(*OFFSETS["both"])
+    change(fields["legs"][1])
+    path = tmp_path / "wrong.yaml"
+    path.write_text(yaml_text(fields))
+    with pytest.raises(InputError) as error:
+        load_mechanism(path)
+    assert field in str(error.value.where)
