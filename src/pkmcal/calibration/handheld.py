@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
@@ -47,8 +47,10 @@ from pkmcal.observe.background import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.image_localization import (
+    IMAGE_LOCALIZATION_OPTIONS,
     PoseHypotheses,
     finest_view,
+    localize_along,
     localize_image,
     localize_near,
 )
@@ -84,6 +86,12 @@ class HandheldOptions:
     # ratio by which the number of images that determine the machine must grow before the poses of
     # an image are scored anew
     rescoring_growth: float = 1.25
+    # factor on the number of hypotheses with which an ambiguous image is localized once more
+    wider: int = 3
+    # distances from the camera of a neighbour that are tried for an image, relative to the
+    # neighbour's distance from the base: from a step to the opposite side; their ratio is that of
+    # the search of a single image
+    apart: Array = field(default_factory=lambda: np.geomspace(0.15, 2.5, 18))
     # largest rotation (rad) by which the joint estimate may change an image's localized pose
     most_turn: float = SAME_POSE_TURN / 2
     # fewest legs of an image, if the machine has so many, and fewest edges that determine its pose.
@@ -217,7 +225,7 @@ def _searched(
     by_hand = [k for k in at if session.stations[k].handheld and k not in stated]
     room = Surroundings(list(at), lambda k: (at[k].images[0], at[k].camera))
     answers: dict[int, _CachedHypotheses] = {}
-    drawn = so_far = _LocalizationState(scene)
+    so_far = _LocalizationState(scene)
 
     def hypotheses() -> dict[int, PoseHypotheses]:
         scored = {k: answer.places for k, answer in answers.items() if answer.scores is not None}
@@ -250,17 +258,17 @@ def _searched(
         so_far = _with_sure(session, at, room, so_far, believed(), boards)
         text = f"Scoring the others, with {len(so_far.placed)} images localized"
         rescore(clearer[half:], text, part(progress, 0.55, 0.7))
-        # join the images of a board, and repeat while images are added
+        # join the images of a board, and score images without an accepted pose again
         for k, one in _on_board(hypotheses(), boards).items():
             answers[k] = replace(answers[k], places=one)
-        before, so_far = drawn, _with_sure(session, at, room, so_far, believed(), boards)
+        so_far = _with_sure(session, at, room, so_far, believed(), boards)
         rest = part(progress, 0.75, 1)
         for _ in range(_OPTIONS.most_rounds):
             T = believed()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
-            if so_far.scene is before.scene or not unsure:
+            if not so_far.placed or not unsure:
                 break
-            before, placed = so_far, len(by_hand) - len(unsure)
+            placed = len(by_hand) - len(unsure)
             text = f"Scoring again, with {placed} of {len(by_hand)} images localized"
             rescore(unsure, text, part(rest, 0, 0.4))
             so_far = _with_sure(session, at, room, so_far, believed(), boards)
@@ -344,7 +352,7 @@ class _CachedHypotheses:
     scores : by the joint estimate, None before it.
     by : marginal prior of the machine at that time, None for the nominal model.
     beside : number of images that determined the machine.
-    anew : whether ``hypotheses`` are by a machine from images.
+    rounds : number of times that the image was scored again and stayed ambiguous before.
     """
 
     hypotheses: PoseHypotheses
@@ -352,7 +360,7 @@ class _CachedHypotheses:
     scores: ScoredPoses | None = None
     by: MarginalPrior | None = None
     beside: int = 0
-    anew: bool = False
+    rounds: int = 0
 
 
 def _with_sure(
@@ -412,13 +420,13 @@ def _too_few_edges(
 def _measurable(
     scene: PriorScene, image: StationImages, hypotheses: PoseHypotheses
 ) -> PoseHypotheses:
-    """The hypotheses at which legs can be measured, or all if there are none.
+    """The hypotheses at which legs can be measured, or all if they cannot at the best.
 
     Silhouettes match anywhere; with a machine from images, legs can be measured at the correct pose
     only, so a rival at which they cannot is none.
     """
     good = [not _too_few_edges(scene, image, T) for T in hypotheses.T_camera_base]
-    if not any(good):
+    if not good[0]:
         return hypotheses
     return hypotheses._replace(
         T_camera_base=hypotheses.T_camera_base[good],
@@ -436,14 +444,19 @@ def _alone(session: Session, scene: PriorScene, image: StationImages) -> PoseHyp
     return hypotheses
 
 
-def _image_hypotheses(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
-    """Pose hypotheses from one image alone."""
+def _image_hypotheses(
+    session: Session, scene: PriorScene, image: StationImages, wider: int = 1
+) -> PoseHypotheses:
+    """Pose hypotheses from one image alone.
+
+    wider : factor on the number of hypotheses that are refined.
+    """
     p = image
     view = StationView(
         scene.machine, p.camera, p.configuration, session.joints, scene.T_base_platform,
         distance_tables([p.images[0]]),
     )  # fmt: skip
-    return localize_image(view, p.images[0])
+    return localize_image(view, p.images[0], IMAGE_LOCALIZATION_OPTIONS.wider(wider))
 
 
 def _search(
@@ -456,15 +469,15 @@ def _search(
     """Pose hypotheses of an image, weighted by its legs and by the background.
 
     The background is compared with that of the images with accepted poses; earlier hypotheses are
-    among the candidates. An image that stays ambiguous is localized by itself once more with the
-    first machine from images; later images change the machine little. Poses that were scored with a
-    similar machine are not scored again.
+    among the candidates. An image that stays ambiguous is localized by the background of each of
+    its neighbours, and if that does not help, by itself once more, among more hypotheses. Poses that
+    were scored with a similar machine are not scored again.
     """
     p, scene, placed, k = image, so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
-    anew = before.anew or (scene.prior is not None and before.scores is not None)
-    if anew and not before.anew:
-        alone = _image_hypotheses(session, scene, p)
+    rounds = before.rounds + (scene.prior is not None and before.scores is not None)
+    if rounds == 2:
+        alone = _image_hypotheses(session, scene, p, _OPTIONS.wider)
     elif (
         scene.prior is not None
         and before.by is not None
@@ -478,13 +491,28 @@ def _search(
     if placed:
         axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
+    if placed and rounds:
+        others = np.concatenate([others, _by_neighbours(session, room, so_far, p)])
     # joint estimate, then the background
     closer, scores = rescore_poses(session, p, scene, alone, others, scores)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
     if scene.prior is not None:
         places = _measurable(scene, p, places)
-    return _CachedHypotheses(alone, places, scores, by, beside, anew)
+    return _CachedHypotheses(alone, places, scores, by, beside, rounds)
+
+
+def _by_neighbours(
+    session: Session, room: Surroundings, so_far: _LocalizationState, image: StationImages
+) -> Array:
+    """Poses (n, 4, 4) of an image by the background of each of its neighbours, at the distance
+    from it at which the legs match best.
+    """
+    p, scene = image.decoded(), so_far.scene
+    away = [np.linalg.norm(one.T_camera_base[:3, 3]) for one in so_far.placed.values()]
+    lines = room.relative(p.station, so_far.placed, _OPTIONS.apart * float(np.median(away)))
+    view = finest_view(scene.machine, p, session.joints, scene.T_base_platform)
+    return localize_along(view, lines, legs.LEG_SEARCH_OPTIONS.sigma)
 
 
 def _legs(

@@ -36,7 +36,7 @@ class BackgroundOptions:
     # noise
     largest_side: int = 1600
     # largest number of features of an image; those of most contrast are used
-    most_features: int = 2000
+    most_features: int = 3000
     # largest ratio of the descriptor distances to the nearest and the second nearest feature at
     # which two features are matched (Lowe, section 7.1)
     distance_ratio: float = 0.8
@@ -64,6 +64,9 @@ class BackgroundOptions:
     # number of landmark triples tried by RANSAC for the pose of an image: a share of one correct
     # landmark in ten suffices to draw three correct ones (derived)
     triples: int = 3000
+    # largest number of sets of five matches tried by RANSAC for the relative pose of two images: a
+    # share of one correct match in four suffices (derived)
+    quintuples: int = 5000
     # cosine of rays to the optical axis below which they are left out of it: normalized
     # coordinates grow beyond bounds
     least_cosine: float = 0.2
@@ -375,6 +378,40 @@ class Surroundings:
         rot = rotation(np.asarray(turn, dtype=float).ravel())
         return pose(rot, np.asarray(shift, dtype=float).ravel())[None]
 
+    def relative(self, one: int, placed: Mapping[int, Neighbour], apart: Array) -> Array:
+        """Camera poses T_camera_base (n, D, 4, 4) of an image by each of its nearest neighbours.
+
+        Two images determine their relative pose up to the distance of the cameras, for which the
+        values ``apart`` (D,), m, are used. Neighbours with too few matches are left out.
+        """
+        import cv2
+
+        out = [np.zeros((0, len(apart), 4, 4))]
+        off = float(np.tan(self.options.spreads[1]))
+        for other in self._nearest(one, placed):
+            j, k = self.shared(one, other)
+            rays = self.texture(one).ray[j], self.texture(other).ray[k]
+            ok = self._beside(other, k, placed[other])
+            for ray in rays:
+                ok &= ray[:, 2] > self.options.least_cosine
+            if np.count_nonzero(ok) < self.options.fewest_pairs:
+                continue
+            here, there = (np.ascontiguousarray(ray[ok, :2] / ray[ok, 2:]) for ray in rays)
+            essential, inside = cv2.findEssentialMat(
+                there, here, np.eye(3), cv2.RANSAC, 0.999, off, self.options.quintuples
+            )
+            if essential is None or essential.shape != (3, 3):  # no solution, or several
+                continue
+            _, turn, along, _ = cv2.recoverPose(essential, there, here, np.eye(3), mask=inside)
+            T = pose(np.asarray(turn, dtype=float), apart[:, None] * np.ravel(along))
+            out.append((T @ placed[other].T_camera_base)[None])
+        return np.concatenate(out)
+
+    def _nearest(self, one: int, placed: Mapping[int, Neighbour]) -> list[int]:
+        """Images with accepted poses that share the most features with an image."""
+        order = sorted(placed, key=lambda k: -len(self.shared(one, k)[0]))
+        return order[: self.options.neighbours]
+
     def about(
         self,
         hypotheses: PoseHypotheses,
@@ -446,8 +483,7 @@ class Surroundings:
         Any of the images with accepted poses may be the one that shows the same part of the room,
         so their likelihoods are added.
         """
-        texture, n_matches = self.texture(one), {k: len(self.shared(one, k)[0]) for k in placed}
-        nearest = sorted(placed, key=lambda k: -n_matches[k])[: self.options.neighbours]
+        texture, nearest = self.texture(one), self._nearest(one, placed)
         gain = np.zeros((len(T_camera_base), len(nearest)))
         outside = [
             beside_machine(texture.pixel, camera, axes, options=self.options) for axes in legs

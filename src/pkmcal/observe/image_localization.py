@@ -76,6 +76,8 @@ class ImageLocalizationOptions:
     on_finer: int = 120
     # number of hypotheses on the finest tables, besides the symmetric poses of the first two
     on_finest: int = 40
+    # number of poses of a line that are refined
+    on_line: int = 6
     # reaches of the steps of the first descent, reduced pixels, falling from the distance at which
     # an edge is attracted
     first_reaches: tuple[float, ...] = (16, 14, 12, 10)
@@ -115,6 +117,11 @@ class ImageLocalizationOptions:
         """Options of distance tables with a multiple of the usual resolution."""
         width = resolution * self.tables.width
         return replace(self.tables, width=width, directions=self.directions)
+
+    def wider(self, factor: int) -> ImageLocalizationOptions:
+        """Options with a multiple of the number of hypotheses."""
+        names = ("refined", "on_coarse", "on_finer", "on_finest")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
 
 
 IMAGE_LOCALIZATION_OPTIONS = ImageLocalizationOptions()
@@ -255,6 +262,27 @@ def refine_local(
             break
         best, most = starts[k], float(log_likelihood_ratio[k])
     return best, most
+
+
+def localize_along(
+    view: StationView,
+    T_camera_base: Array,
+    scatter: float,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> Array:
+    """Likeliest pose (N, 4, 4) of each of N lines of poses (N, D, 4, 4), such as a camera's at
+    unknown distance in a given direction.
+
+    view : with the finest tables. scatter : as of :func:`refine_local`.
+    """
+    one = np.zeros(1, dtype=int)
+    out = np.zeros((0, 4, 4))
+    for line in T_camera_base:
+        starts = _most(view, line, 8, options.on_line)
+        starts, log_likelihood_ratio = refine_ml(view, starts, one, 8, 6)
+        best = starts[np.argmax(log_likelihood_ratio)]
+        out = np.concatenate([out, refine_local(view, best, scatter)[0][None]])
+    return out
 
 
 def localize_near(
