@@ -155,6 +155,18 @@ def test_landmarks_are_where_the_points_are():
         assert np.abs(pixel - scene.textures[k].pixel[above_limit.number]).max() < 1e-3
 
 
+def test_a_neighbour_determines_the_pose_up_to_the_distance():
+    """The camera lies on the line of poses, as far along it as the cameras are apart."""
+    s = Scene([0, 15, 180], seed=4)
+    apart = np.linalg.norm((inverse(s.T[0]) - inverse(s.T[1]))[:3, 3])
+    lines = s.room.relative(0, s.placed(1, 2), np.array([0.5, 1.0]) * apart)
+    assert lines.shape == (1, 2, 4, 4)  # the third camera shows another part of the room
+    assert np.degrees(angle_between(lines[0], s.T[0])).max() < 1.0
+    assert np.linalg.norm((inverse(lines[0, 1]) - inverse(s.T[0]))[:3, 3]) < 0.2 * apart
+    halfway = (inverse(s.T[0]) + inverse(s.T[1]))[:3, 3] / 2
+    np.testing.assert_allclose(inverse(lines[0, 0])[:3, 3], halfway, atol=0.1 * apart)
+
+
 def test_an_image_of_another_part_of_the_room_is_not_placed():
     scene = Scene([0, 12, 24, 180], seed=7)
     assert not len(scene.room.place(3, scene.room.landmarks(scene.placed(0, 1, 2))))

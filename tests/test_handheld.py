@@ -601,9 +601,8 @@ def localized_with(monkeypatch, truth, faults, textured=False):
         return places, ScoredPoses.nothing()
 
     nowhere = PoseHypotheses(np.eye(4)[None], np.zeros(1), 1.0)
-    monkeypatch.setattr(handheld, "localize_image", lambda _view, _image: nowhere)
+    monkeypatch.setattr(handheld, "localize_image", lambda *_: nowhere)
     monkeypatch.setattr(handheld, "rescore_poses", measure)
-    monkeypatch.setattr(handheld, "_measurable", lambda _scene, _image, places: places)
     monkeypatch.setattr(handheld, "THREADS", 1)
     if not textured:
         empty = Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
@@ -719,14 +718,6 @@ def test_legs_are_measured_where_an_image_is_and_not_elsewhere(searched):
     turn = pose(rotation(np.array([0.0, 0.0, np.radians(40.0)])), np.zeros(3))
     elsewhere = there._replace(T_camera_base=truth.T_camera_base @ turn)
     assert handheld._too_few_edges(elsewhere, p)
-    # a rival there is none
-    T = truth.T_camera_base[EASIEST]
-    places = PoseHypotheses(np.stack([T @ turn, T]), np.array([9.0, 8.0]), 1.0)
-    retained = handheld._measurable(there, p, places)
-    np.testing.assert_array_equal(retained.T_camera_base, T[None])
-    assert retained.rival_probability < places.rival_probability
-    nowhere = places._replace(T_camera_base=np.stack([T @ turn, T @ turn @ turn]))
-    assert handheld._measurable(there, p, nowhere) is nowhere
 
 
 def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):

@@ -298,12 +298,12 @@ def _with_stated(
 
 
 def _placed_at(so_far: _LocalizationState, believed: Array, by_hand: Sequence[int]) -> Array:
-    """T_camera_base (S, 4, 4) in the end: estimated for registered images, NaN where too few legs
-    can be measured.
+    """T_camera_base (S, 4, 4) in the end: estimated for registered images, NaN for those that are
+    not accepted any more and where too few legs can be measured.
     """
     out = believed.copy()
     for k in by_hand:
-        if k in so_far.scene.edges:
+        if k in so_far.scene.edges and not np.isnan(out[k]).any():
             out[k] = so_far.scene.T_camera_base[k]
         elif k in so_far.bare:
             out[k] = np.nan
@@ -352,7 +352,7 @@ class _CachedHypotheses:
     scores : by the joint estimate, None before it.
     by : marginal prior of the machine at that time, None for the nominal model.
     beside : number of images that determined the machine.
-    rounds : number of times that the image was scored again and stayed ambiguous before.
+    anew : whether ``hypotheses`` are by a machine from images.
     """
 
     hypotheses: PoseHypotheses
@@ -360,7 +360,7 @@ class _CachedHypotheses:
     scores: ScoredPoses | None = None
     by: MarginalPrior | None = None
     beside: int = 0
-    rounds: int = 0
+    anew: bool = False
 
 
 def _with_sure(
@@ -406,32 +406,12 @@ def _with_sure(
     return _LocalizationState(scene, placed, room.landmarks(placed), bare)
 
 
-def _too_few_edges(
-    scene: PriorScene, image: StationImages, T_camera_base: Array | None = None
-) -> bool:
-    """Whether too few legs can be measured in an image at a pose (4, 4), by default the scene's."""
+def _too_few_edges(scene: PriorScene, image: StationImages) -> bool:
+    """Whether too few legs can be measured in an image at its pose."""
     p, machine = image, scene.machine
-    T = scene.T_camera_base[p.station] if T_camera_base is None else T_camera_base
-    poses = scene.T_base_platform[p.configuration]
+    T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
     visible = np.unique(legs.measure(p, machine, T, poses).edges.leg)
     return len(visible) < min(_OPTIONS.fewest_legs, machine.n_legs)
-
-
-def _measurable(
-    scene: PriorScene, image: StationImages, hypotheses: PoseHypotheses
-) -> PoseHypotheses:
-    """The hypotheses at which legs can be measured, or all if they cannot at the best.
-
-    Silhouettes match anywhere; with a machine from images, legs can be measured at the correct pose
-    only, so a rival at which they cannot is none.
-    """
-    good = [not _too_few_edges(scene, image, T) for T in hypotheses.T_camera_base]
-    if not good[0]:
-        return hypotheses
-    return hypotheses._replace(
-        T_camera_base=hypotheses.T_camera_base[good],
-        log_likelihood_ratio=hypotheses.log_likelihood_ratio[good],
-    )
 
 
 def _alone(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
@@ -469,14 +449,15 @@ def _search(
     """Pose hypotheses of an image, weighted by its legs and by the background.
 
     The background is compared with that of the images with accepted poses; earlier hypotheses are
-    among the candidates. An image that stays ambiguous is localized by the background of each of
-    its neighbours, and if that does not help, by itself once more, among more hypotheses. Poses that
-    were scored with a similar machine are not scored again.
+    among the candidates. An image that stays ambiguous is localized with the first machine from
+    images: by itself once more, among more hypotheses, because later images change the machine
+    little, and by the background of each of its neighbours. Poses that were scored with a similar
+    machine are not scored again.
     """
     p, scene, placed, k = image, so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
-    rounds = before.rounds + (scene.prior is not None and before.scores is not None)
-    if rounds == 2:
+    anew = before.anew or (scene.prior is not None and before.scores is not None)
+    if anew and not before.anew:
         alone = _image_hypotheses(session, scene, p, _OPTIONS.wider)
     elif (
         scene.prior is not None
@@ -491,15 +472,13 @@ def _search(
     if placed:
         axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
-    if placed and rounds:
+    if placed and anew:
         others = np.concatenate([others, _by_neighbours(session, room, so_far, p)])
     # joint estimate, then the background
     closer, scores = rescore_poses(session, p, scene, alone, others, scores)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
-    if scene.prior is not None:
-        places = _measurable(scene, p, places)
-    return _CachedHypotheses(alone, places, scores, by, beside, rounds)
+    return _CachedHypotheses(alone, places, scores, by, beside, anew)
 
 
 def _by_neighbours(

@@ -28,6 +28,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.distance_tables import (
     DISTANCE_TABLE_OPTIONS,
     DistanceTableOptions,
+    DistanceTables,
     distance_tables,
 )
 from pkmcal.observe.image_batches import StationImages
@@ -223,17 +224,24 @@ def distinct(view: StationView, values: Array) -> Integers:
     return rows[~same_pose(values[rows], values[0]) | (rows == 0)]
 
 
+def finest_tables(image: StationImages) -> DistanceTables:
+    """Distance tables of one image, at the largest resolution that is used."""
+    return distance_tables([image.images[0]], IMAGE_LOCALIZATION_OPTIONS.tables_at(4))
+
+
 def finest_view(
     machine: Machine,
     image: StationImages,
     joints: Array,
     poses: Array,
+    tables: DistanceTables | None = None,
 ) -> StationView:
     """View of one image with the finest tables.
 
     joints, poses : of all configurations of the session; the latter are T_base_platform.
+    tables : of the image, computed if None.
     """
-    tables = distance_tables([image.images[0]], IMAGE_LOCALIZATION_OPTIONS.tables_at(4))
+    tables = tables or finest_tables(image)
     return StationView(machine, image.camera, image.configuration, joints, poses, tables)
 
 
