@@ -161,7 +161,7 @@ def test_a_neighbour_determines_the_pose_up_to_the_distance():
     apart = np.linalg.norm((inverse(s.T[0]) - inverse(s.T[1]))[:3, 3])
     lines = s.room.relative(0, s.placed(1, 2), np.array([0.5, 1.0]) * apart)
     assert lines.shape == (1, 2, 4, 4)  # the third camera shows another part of the room
-    assert np.degrees(angle_between(lines[0], s.T[0])).max() < 1.0
+    assert np.degrees(angle_between(lines[0], s.T[0])).max() < 3.0
     assert np.linalg.norm((inverse(lines[0, 1]) - inverse(s.T[0]))[:3, 3]) < 0.2 * apart
     halfway = (inverse(s.T[0]) + inverse(s.T[1]))[:3, 3] / 2
     np.testing.assert_allclose(inverse(lines[0, 0])[:3, 3], halfway, atol=0.1 * apart)
