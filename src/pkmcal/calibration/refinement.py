@@ -285,20 +285,20 @@ def imputation_variance(
     # edges that drawn machines predict
     machines = list(_as_likely(session, estimate, options.imputations, rng))
     cameras = [turns.cameras.updated(drawn) for drawn in machines]
-    looks = [
-        _Look(drawn, [replace(p, camera=own.at_station(p.station)) for p in turns.images])
+    predictions = [
+        _Prediction(drawn, [replace(p, camera=own.at_station(p.station)) for p in turns.images])
         for drawn, own in zip(machines, cameras, strict=True)
     ]
-    total = sum(len(p.images) for p in turns.images) * len(looks)
+    total = sum(len(p.images) for p in turns.images) * len(predictions)
     done = _counted(part(progress, 0, 0.5), "Measuring edges from drawn machines", total)
     active = turns.cameras.active
-    passes = _measurement_passes(session, looks, turns.blur, turns.scatter, active, done)
+    passes = _measurement_passes(session, predictions, turns.blur, turns.scatter, active, done)
     # and the estimates from them
     offsets: list[Array] = []
     failures: list[str] = []
     for number, (drawn, own, one) in enumerate(zip(machines, cameras, passes, strict=True)):
-        text = f"Identifying from a drawn machine's edges: {number + 1} of {len(looks)}"
-        progress(text, 0.5 + 0.5 * number / len(looks))
+        text = f"Identifying from a drawn machine's edges: {number + 1} of {len(predictions)}"
+        progress(text, 0.5 + 0.5 * number / len(predictions))
         try:
             edges = _edges(one, options)
             measurements = measurements_of(session, case.boards, edges, own, estimate)
@@ -361,7 +361,7 @@ def _variance(changes: Array, estimate: Estimate) -> float:
     return float(np.mean(np.sum((changes @ white) ** 2, axis=1))) / trace
 
 
-class _Look(NamedTuple):
+class _Prediction(NamedTuple):
     """Estimate that predicts edges, and the images of all stations with its cameras."""
 
     estimate: Estimate
@@ -378,33 +378,35 @@ def _measurement_pass(
     done: legs.ImageBatchesInUse | None = None,
 ) -> list[legs.StationEdges]:
     """Edges of all images, measured where the estimate predicts them."""
-    return _measurement_passes(session, [_Look(estimate, images)], blur, scatter, refine, done)[0]
+    return _measurement_passes(
+        session, [_Prediction(estimate, images)], blur, scatter, refine, done
+    )[0]
 
 
 def _measurement_passes(
     session: Session,
-    looks: Sequence[_Look],
+    predictions: Sequence[_Prediction],
     blur: BlurByStation,
     scatter: float,
     refine: bool,
     done: legs.ImageBatchesInUse | None = None,
 ) -> list[list[legs.StationEdges]]:
     """Edges of all images, by estimate, measured where each of the estimates predicts them."""
-    numbers = {p.station: n for n, p in enumerate(looks[0].images)}
-    estimates = [look.estimate for look in looks]
+    numbers = {p.station: n for n, p in enumerate(predictions[0].images)}
+    estimates = [prediction.estimate for prediction in predictions]
 
     def measure(some: Sequence[StationImages]) -> list[list[legs.StationEdges]]:
-        own = [[look.images[numbers[p.station]] for p in some] for look in looks]
+        own = [[prediction.images[numbers[p.station]] for p in some] for prediction in predictions]
         passes = [
-            _measure(images, look.estimate, blur, refine, done)
-            for look, images in zip(looks, own, strict=True)
+            _measure(images, prediction.estimate, blur, refine, done)
+            for prediction, images in zip(predictions, own, strict=True)
         ]
         whole = partial(_with_silhouettes, session, estimates, scatter, refine)
         with ThreadPoolExecutor(THREADS) as pool:  # distance tables take most of the time
             return list(pool.map(whole, zip(*own, strict=True), zip(*passes, strict=True)))
 
-    stations = _search_pass(looks[0].images, measure)
-    return [[combine_repeats(one[n]) for one in stations] for n in range(len(looks))]
+    stations = _search_pass(predictions[0].images, measure)
+    return [[combine_repeats(one[n]) for one in stations] for n in range(len(predictions))]
 
 
 def _checked_pass(
