@@ -49,6 +49,13 @@ class Run:
         return json.loads(self.out, parse_constant=pytest.fail)
 
 
+@pytest.fixture(autouse=True)
+def cache_of_one_test(tmp_path_factory, monkeypatch, request):
+    """A cache folder of its own: no result depends on another test's."""
+    number = format(abs(hash(request.node.nodeid)), "x")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache" / number))
+
+
 def run(*words) -> Run:
     """One command through the real entry point, in this process."""
     out, err = io.StringIO(), io.StringIO()

@@ -58,6 +58,7 @@ class Scene:
         height = rng.uniform(-0.8, 1.5, points)
         world = np.stack([away * np.cos(angle), away * np.sin(angle), height], axis=-1)
         names = rng.standard_normal((points, 128)).astype(np.float32)
+        names /= np.linalg.norm(names, axis=1, keepdims=True)
         self.T = [looking(a) for a in azimuths]
         self.textures = []
         for T in self.T:
@@ -70,7 +71,9 @@ class Scene:
             mistaken = rng.random(len(mine)) < wrong
             mine[mistaken] = mine[mistaken][rng.permutation(mistaken.sum())]
             self.textures.append(Texture(CAMERA.ray(pixel), pixel, mine))
-        self.room = Surroundings(lambda _: (np.zeros((0, 0), dtype=np.uint8), CAMERA))
+        self.room = Surroundings(
+            range(len(azimuths)), lambda _: (np.zeros((0, 0), dtype=np.uint8), CAMERA)
+        )
         self.room.texture = lambda k: self.textures[k]
 
     def placed(self, *which):
@@ -150,6 +153,18 @@ def test_landmarks_are_where_the_points_are():
         T = scene.T[k]
         pixel = CAMERA.project(above_limit.point @ T[:3, :3].T + T[:3, 3])
         assert np.abs(pixel - scene.textures[k].pixel[above_limit.number]).max() < 1e-3
+
+
+def test_a_neighbour_determines_the_pose_up_to_the_distance():
+    """The camera lies on the line of poses, as far along it as the cameras are apart."""
+    s = Scene([0, 15, 180], seed=4)
+    apart = np.linalg.norm((inverse(s.T[0]) - inverse(s.T[1]))[:3, 3])
+    lines = s.room.relative(0, s.placed(1, 2), np.array([0.5, 1.0]) * apart)
+    assert lines.shape == (1, 2, 4, 4)  # the third camera shows another part of the room
+    assert np.degrees(angle_between(lines[0], s.T[0])).max() < 3.0
+    assert np.linalg.norm((inverse(lines[0, 1]) - inverse(s.T[0]))[:3, 3]) < 0.2 * apart
+    halfway = (inverse(s.T[0]) + inverse(s.T[1]))[:3, 3] / 2
+    np.testing.assert_allclose(inverse(lines[0, 0])[:3, 3], halfway, atol=0.1 * apart)
 
 
 def test_an_image_of_another_part_of_the_room_is_not_placed():

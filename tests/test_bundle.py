@@ -335,7 +335,7 @@ def test_constraints_on_a_machine_replace_the_data_behind_them():
     start = start_state(scene.machine, both, guess(rng, scene.T_camera_base))
     plain = {"robust": False, "scale_noise": False}
     before = bundle(scene.machine, one, start, **plain)
-    information = marginalize_to_machine(before)
+    information = marginalize_to_machine(before.linearized.info)
     start = replace(start, theta=before.state.theta)
     fit = bundle(scene.machine, other, start, marginal_prior=information, **plain)
     together = bundle(scene.machine, all_, start, **plain)
@@ -354,7 +354,7 @@ def test_constraints_on_a_machine_replace_the_data_behind_them():
     )
     np.testing.assert_array_equal(without.state.theta, fit.state.theta)
     # a motion below its standard deviation changes nothing; by the nominal model alone it did
-    after = marginalize_to_machine(together)
+    after = marginalize_to_machine(together.linearized.info)
     assert after.like(after)
     assert not after.like(replace(information, free=np.zeros_like(information.free)))
 

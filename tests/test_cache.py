@@ -1,8 +1,18 @@
 """The user's cache folder: its contents, and that nothing depends on it."""
 
+import os
+
+import numpy as np
 import pytest
 
-from pkmcal.files import remember, remembered
+from pkmcal.files import (
+    cached_arrays,
+    digest_of,
+    remember,
+    remember_arrays,
+    remembered,
+    remembered_arrays,
+)
 
 
 @pytest.fixture
@@ -29,3 +39,39 @@ def test_a_cache_that_cannot_be_written_changes_nothing(folder, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
     remember("a", b"b")
     assert remembered("a") is None
+
+
+def test_arrays_are_read_again(folder):
+    arrays = {"a.b": np.arange(6.0).reshape(2, 3), "mask": np.array([True, False])}
+    remember_arrays("a", arrays)
+    again = remembered_arrays("a")
+    assert again.keys() == arrays.keys()
+    assert all(np.array_equal(again[key], arrays[key]) for key in arrays)
+    assert remembered_arrays("b") is None
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK", b"no archive", None])
+def test_a_damaged_file_counts_as_absent(folder, damage):
+    remember_arrays("a", {"x": np.arange(1000.0)})
+    (path,) = folder.rglob("a.npz")
+    whole = path.read_bytes()
+    path.write_bytes(whole[:100] + bytes(60) + whole[160:] if damage is None else damage)
+    assert remembered_arrays("a") is None
+
+
+def test_the_oldest_arrays_are_removed(folder, monkeypatch):
+    noise = np.random.default_rng(0).integers(0, 2**62, 1000)
+    monkeypatch.setattr(cached_arrays, "MOST_CACHED_BYTES", 20_000)
+    for age, name in enumerate("abc"):
+        remember_arrays(name, {"x": noise})
+        (path,) = folder.rglob(f"{name}.npz")
+        os.utime(path, (age, age))
+    assert remembered_arrays("b") is not None  # and counts as used just now
+    remember_arrays("d", {"x": noise})
+    assert sorted(path.stem for path in folder.rglob("*.npz")) == ["b", "d"]
+
+
+def test_a_digest_follows_values_and_types():
+    parts = [np.zeros(3), np.zeros(3, dtype=int), np.zeros((3, 1)), np.array([0, 0, 1.0]), [0], "0"]
+    assert len({digest_of(part) for part in parts}) == len(parts)
+    assert digest_of(np.zeros(3), "a") == digest_of(np.zeros(3), "a")

@@ -45,6 +45,23 @@ def test_only_the_numbers_change():
 @pytest.mark.parametrize(
     ("station", "after"),
     [
+        ("  hand:\n    observe: legs\n  rear: {}\n",
+         "  hand:\n    observe: legs\n    poses:\n      0003-2: {position: [0.25, -1.5, 0.125],"
+         " look_at: [0.0, 0.5, 0.2], up: [0.1, 0.0, 0.9]}\n  rear: {}\n"),
+        ("  hand: {observe: legs, poses: {0004: {position: [1, 2, 3]}}}\n",
+         "  hand: {observe: legs, poses: {0004: {position: [1, 2, 3]}, 0003-2: {position:"
+         " [0.25, -1.5, 0.125], look_at: [0.0, 0.5, 0.2], up: [0.1, 0.0, 0.9]}}}\n"),
+    ],
+)  # fmt: skip
+def test_a_pose_of_one_image_is_added(station, after):
+    keys = ("stations", "hand", "poses", "0003-2")
+    done = with_numbers(HEAD + station, "session.yaml", keys, POSE, with_parent=True)
+    assert done == HEAD + after
+
+
+@pytest.mark.parametrize(
+    ("station", "after"),
+    [
         ("  front:\n    observe: legs  # seen\n\n    # last\n",
          "  front:\n    observe: legs  # seen\n    pose:\n      position: [0.25, -1.5, 0.125]\n"
          "      look_at: [0.0, 0.5, 0.2]\n      up: [0.1, 0.0, 0.9]\n\n    # last\n"),

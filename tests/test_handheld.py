@@ -34,9 +34,19 @@ from pkmcal.calibration.results import calibration_document
 from pkmcal.checks.check import check_session
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import Exif, open_image, read_exif, with_exif
-from pkmcal.geometry.rigid import angle_between, apply, perturb, pose, pose_difference, rotation
+from pkmcal.files.cache import cache_folder
+from pkmcal.geometry.rigid import (
+    angle_between,
+    apply,
+    look_at,
+    perturb,
+    pose,
+    pose_difference,
+    rotation,
+)
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.judge.new_data import measured_new_data
 from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
 from pkmcal.measurements.effects import FOCAL_EXCESS, FOCAL_SIGMA, SHADING
 from pkmcal.mechanisms import load_mechanism
@@ -56,6 +66,7 @@ from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, tube_chart
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Level
+from pkmcal.outcome.progress import no_progress
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.placement.stations import rough_poses
 from pkmcal.report.calibration import outcome_of
@@ -408,7 +419,8 @@ def test_a_rejected_image_is_counted_named_and_shown(breathed):
     assert card.values == (("3 of 4", "images"),)
     file = "images/phone/0001-1.jpg"
     (rows,) = [one.text for one in outcome.findings]
-    assert rows == f"{file}: left out, for {EDGES_DISAGREE_REASON}."
+    assert rows == fewer.rejected[0].finding.text
+    assert rows.startswith(f"{file}: left out, for {EDGES_DISAGREE_REASON}.")
     entry = {
         "file": file, "station": "phone-0001-2", "configuration": "0001",
         "reason": EDGES_DISAGREE_REASON,
@@ -589,7 +601,7 @@ def localized_with(monkeypatch, truth, faults, textured=False):
         return places, ScoredPoses.nothing()
 
     nowhere = PoseHypotheses(np.eye(4)[None], np.zeros(1), 1.0)
-    monkeypatch.setattr(handheld, "localize_image", lambda _view, _image: nowhere)
+    monkeypatch.setattr(handheld, "localize_image", lambda *_: nowhere)
     monkeypatch.setattr(handheld, "rescore_poses", measure)
     monkeypatch.setattr(handheld, "THREADS", 1)
     if not textured:
@@ -611,6 +623,7 @@ def test_the_room_may_decide_what_legs_do_not(searched, monkeypatch):
     rng = np.random.default_rng(2)
     world = rng.uniform(-1.2, 1.2, (6000, 3))
     names = rng.standard_normal((len(world), 128)).astype(np.float32)
+    names /= np.linalg.norm(names, axis=1, keepdims=True)
 
     def texture(image, camera, _options):
         k = next(k for k, p in enumerate(images) if p.images[0] is image)
@@ -623,6 +636,25 @@ def test_the_room_may_decide_what_legs_do_not(searched, monkeypatch):
     monkeypatch.setattr(background, "texture_of", texture)
     results = placed(searched, monkeypatch, [1e-4, 0.3, 1e-4], textured=True)
     assert [s.name for s in results.session.stations] == [s.name for s in searched[0].stations]
+
+
+def posed(folder, words):
+    replaced(folder / "session.yaml", "handheld: true", f"handheld: true\n    {words}")
+
+
+def test_a_single_image_has_a_pose(folder):
+    place = "{position: [0, -1, 0.5], look_at: [0, 0, 0.2]}"
+    posed(folder, f"poses: {{0000-2: {place}}}")
+    first, second, third = load_session(folder).stations
+    assert (first.T_camera_base, third.T_camera_base) == (None, None)
+    np.testing.assert_allclose(second.T_camera_base, look_at([0, -1, 0.5], [0, 0, 0.2], [0, 0, 1]))
+
+
+def test_a_pose_of_an_image_that_is_not_there_is_refused(folder):
+    posed(folder, "poses: {0000-3: {position: [0, -1, 0.5], look_at: [0, 0, 0.2]}}")
+    with pytest.raises(InputError) as caught:
+        load_session(folder)
+    assert "stations.phone.poses.0000-3" in str(caught.value)
 
 
 def test_a_board_on_the_base_serves_images_by_hand(folder):
@@ -699,6 +731,62 @@ def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):
     )
     assert not any("not localized" in text for text in words)
     assert check.forecast is None
+
+
+def test_the_same_images_are_searched_once(searched, monkeypatch):
+    """Cached poses, edges and rejections are those of the search; other data are searched."""
+    session, images, _, _ = searched
+    first = placed(searched, monkeypatch, [1e-4, 0.3, 1e-4])
+
+    def searched_again(*_):
+        raise RuntimeError
+
+    monkeypatch.setattr(handheld, "rescore_poses", searched_again)
+    arguments = images, Boards(), np.random.default_rng(0)
+    again = handheld.localize_case(session, *arguments)
+    np.testing.assert_array_equal(again.scene.T_camera_base, first.scene.T_camera_base)
+    np.testing.assert_array_equal(again.scene.machine.values, first.scene.machine.values)
+    assert again.session.warnings == first.session.warnings
+    for k, edges in first.scene.edges.items():
+        np.testing.assert_array_equal(again.scene.edges[k].normal, edges.normal)
+        np.testing.assert_array_equal(again.scene.edges[k].coarse, edges.coarse)
+    noisier = replace(session, joint_noise=2 * session.joint_noise)
+    with pytest.raises(RuntimeError):
+        handheld.localize_case(noisier, *arguments)
+    # a file of something else under the right name
+    (path,) = cache_folder().glob("session-*.npz")
+    np.savez(path, images=np.arange(3))
+    with pytest.raises(RuntimeError):
+        handheld.localize_case(session, *arguments)
+
+
+@pytest.mark.slow
+def test_new_data_of_a_calibrated_machine_use_the_same_poses(searched, monkeypatch):
+    """Which `check` and `calibrate` cached, by the session's nominal model."""
+    session, _, _, truth = searched
+    first = placed(searched, monkeypatch, [1e-4, 1e-4, 1e-4])
+
+    def searched_again(*_):
+        raise RuntimeError
+
+    monkeypatch.setattr(handheld, "rescore_poses", searched_again)
+    saved = SimpleNamespace(machine=truth.machine, document={"stations": []})
+    value = measured_new_data(saved, session, 0, no_progress)
+    assert value.session.machine is truth.machine
+    names = [station.name for station in first.session.stations]
+    assert [station.name for station in value.session.stations] == names
+
+
+def test_a_pose_by_hand_places_an_ambiguous_image(searched, monkeypatch):
+    session, images, poses, truth = searched
+    rough = perturb(truth.T_camera_base[1], np.array([0.03, -0.03, 0.02, 0.02, -0.02, 0.03]))
+    first, second, third = session.stations
+    posed = replace(session, stations=(first, replace(second, T_camera_base=rough), third))
+    assert placed(searched, monkeypatch, [1e-4, 0.3, 1e-4]).session.rejected
+    results = placed((posed, images, poses, truth), monkeypatch, [1e-4, 0.3, 1e-4])
+    assert not results.session.rejected
+    off = pose_difference(results.scene.T_camera_base, truth.T_camera_base)
+    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
 
 
 def test_no_image_by_hand_is_localized(searched, monkeypatch):

@@ -29,7 +29,16 @@ from fuzz.run import listing
 from page_documents import page_document
 from pkmcal.cameras.files import camera_text
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import apply, inverse, perturb, pose, pose_difference, rotation
+from pkmcal.files import read_yaml
+from pkmcal.geometry.rigid import (
+    apply,
+    inverse,
+    look_at,
+    perturb,
+    pose,
+    pose_difference,
+    rotation,
+)
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
@@ -497,12 +506,21 @@ def test_somebody_elses_change_is_not_written_over(session, truth):
     assert file.read_text() == text
 
 
-def test_a_camera_by_hand_has_no_pose_to_be_written(session, truth):
-    station = replace(load_session(session).stations[0], handheld=True)
-    before = (session / "session.yaml").read_bytes()
-    with pytest.raises(InputError, match="hand-held camera has no single pose"):
-        PoseFile(session).write(station, truth.T_camera_base[0])
-    assert (session / "session.yaml").read_bytes() == before
+def test_the_pose_of_an_image_by_hand_is_written_under_its_name(session, truth):
+    file = session / "session.yaml"
+    before = read_yaml(file).data
+    first, T = load_session(session).stations[0], truth.T_camera_base[0]
+    image = f"{first.images[0].path.stem}"
+    station = replace(first, name=f"{first.name}-{image}", handheld=True)
+    PoseFile(session).write(station, T)
+    entry = read_yaml(file).data["stations"][first.name]
+    assert list(entry["poses"]) == [image]
+    there = entry["poses"][image]
+    written = look_at(there["position"], there["look_at"], there["up"])
+    np.testing.assert_allclose(written, T, atol=1e-3)  # as many digits as are written
+    after = read_yaml(file).data
+    del after["stations"][first.name]["poses"]
+    assert after == before
 
 
 def test_nothing_is_written_through_a_link(session, tmp_path, truth):

@@ -341,10 +341,11 @@ export interface Configuration {
 /**
  * Lines of a leg in one configuration.
  *
- * base : from where a motor holds the arm, if there is one, to A.
+ * base : from the motor of the arm, if there is one, to A.
  * platform : from the hinge of a bar, if there is one, to B.
- * positive : way of the moving point as the reading grows, for an arrow beside it.
- * zero : the arm, or A, or the point of the leg from which its length is counted, at reading zero.
+ * positive : direction of the moving point for an increasing reading, for an arrow beside it.
+ * zero : position of the arm, of A, or of the point from which the leg's length is counted, at
+ *     reading zero.
  */
 export interface LegConfiguration {
   base: [number, number, number][];
@@ -645,13 +646,13 @@ export interface JointAxis {
   label: string;
 }
 /**
- * What of a leg does not depend on the configuration.
+ * Properties of a leg that do not depend on the configuration.
  *
  * number : from 1.
  * reading : index of its reading, null without one.
  * body : index of the platform's bar on which the leg ends, null for a rigid platform.
- * tubes : empty if the file has none; then the rod is drawn with a thin line.
- * path : of A over the range of the reading; empty if the reading does not move A.
+ * tubes : empty if the file has none; the rod is then drawn as a thin line.
+ * path : positions of A over the range of the reading; empty if the reading does not move A.
  * rows : its parameters.
  */
 export interface Leg {
@@ -774,7 +775,7 @@ export interface Machine {
  * low, high : range of the slider.
  * stated : whether this is the range of the mechanism file; otherwise it is an assumption.
  * legs : indices of the legs that it moves.
- * direction, zero : sentences on what a larger reading does, and where the reading is zero.
+ * direction, zero : sentences on the effect of a larger reading, and on the position at zero.
  */
 export interface Reading {
   name: string;
@@ -1101,7 +1102,7 @@ export interface SessionDocument {
  * Station with its images.
  *
  * legs : whether it can be localized by the legs in its images.
- * handheld : it has no one pose.
+ * handheld : a single image by hand.
  * posed : whether session.yaml has its pose.
  * images : without overlays, which the page requests.
  */

@@ -33,7 +33,12 @@ from pkmcal.calibration.faults import (
     scale_notes,
     size_notes,
 )
-from pkmcal.calibration.handheld import inconsistent_poses, localize_case, without_misplaced
+from pkmcal.calibration.handheld import (
+    inconsistent_poses,
+    localization_share,
+    localize_case,
+    without_misplaced,
+)
 from pkmcal.calibration.heights import ProbedHeights, probed_heights
 from pkmcal.calibration.image_rotation import UpsideDown, rotation_finding, upside_down
 from pkmcal.calibration.leg_numbering import numbering_note
@@ -194,7 +199,8 @@ def calibrate_session(
     with threadpool_limits(1, "blas"):
         clock = Clock(progress)
         session = _load(session, refine_camera, holdout, clock)
-        located = case or _observe(session, seed, clock.part(0, 0.25))
+        share = localization_share(session)
+        located = case or observed_case(session, seed, clock.part(0, share))
 
         def calibrated(refine: bool, first: float, last: float) -> Calibration:
             own = clock.part(first, last)
@@ -202,9 +208,10 @@ def calibrate_session(
             return _finished(settled, method, seed, holdout, own.part(0.5, 1))
 
         if not refine_camera or refinement_of(session, False).refines_all:
-            return calibrated(refine_camera, 0.25, 1)
+            return calibrated(refine_camera, share, 1)
+        middle = (share + 1) / 2
         return better_refined(
-            partial(calibrated, True, 0.25, 0.6), partial(calibrated, False, 0.6, 1)
+            partial(calibrated, True, share, middle), partial(calibrated, False, middle, 1)
         )
 
 
@@ -372,7 +379,7 @@ def settle(
             repaired = session
             for one in repairs:
                 repaired = one.hypothesis.apply(repaired)
-            case = _observe(repaired, seed, now.part(0.9, 1))
+            case = observed_case(repaired, seed, now.part(0.9, 1))
             continue
         # stations with a wrong localized pose
         wrong = misplaced_stations(case.session, turns) or inconsistent_poses(
@@ -439,9 +446,11 @@ def _load(
     return session
 
 
-def _observe(session: Session, seed: int, clock: Clock) -> Case:
+def observed_case(session: Session, seed: int, clock: Clock) -> Case:
     """Case of a session with its stations localized, without hand-held images that were not
     localized.
+
+    seed : for the random search. Raises as :func:`calibrate_session`.
     """
     clock.progress("Reading images" if session.stations else "Reading the measurements", 0.0)
     images = read_images(session)

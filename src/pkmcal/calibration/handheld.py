@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
@@ -28,6 +28,15 @@ from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.localization import LegLocalization, locate_stations
+from pkmcal.calibration.localization_cache import (
+    Localized,
+    image_name,
+    remember_image,
+    remember_session,
+    remembered_image,
+    remembered_session,
+    session_name,
+)
 from pkmcal.calibration.pose_scoring import ScoredPoses, register_images, rescore_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
@@ -38,7 +47,14 @@ from pkmcal.observe import legs
 from pkmcal.observe.background import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.image_batches import StationImages
-from pkmcal.observe.image_localization import PoseHypotheses, localize_image
+from pkmcal.observe.image_localization import (
+    IMAGE_LOCALIZATION_OPTIONS,
+    PoseHypotheses,
+    finest_view,
+    localize_along,
+    localize_image,
+    localize_near,
+)
 from pkmcal.observe.pose_candidates import SAME_POSE_TURN, same_pose
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
@@ -64,9 +80,20 @@ class HandheldOptions:
     # number of an image's best poses that are always scored again when the machine is known better,
     # whatever their score by the image alone, because a wrong pose corrupts the estimate
     scored_again: int = 4
+    # largest number of images that are scored with the nominal model, which takes twice as long as
+    # with a machine from images
+    most_from_nominal: int = 12
+    # largest number of rounds in which images without an accepted pose are scored again
+    most_rounds: int = 2
     # ratio by which the number of images that determine the machine must grow before the poses of
     # an image are scored anew
     rescoring_growth: float = 1.25
+    # factor on the number of hypotheses with which an ambiguous image is localized once more
+    wider: int = 3
+    # distances from the camera of a neighbour that are tried for an image, relative to the
+    # neighbour's distance from the base: from a step to the opposite side; their ratio is that of
+    # the search of a single image
+    apart: Array = field(default_factory=lambda: np.geomspace(0.15, 2.5, 18))
     # largest rotation (rad) by which the joint estimate may change an image's localized pose
     most_turn: float = SAME_POSE_TURN / 2
     # fewest legs of an image, if the machine has so many, and fewest edges that determine its pose.
@@ -91,6 +118,12 @@ class Localization:
     leg_localization: LegLocalization | None
     places: Mapping[int, PoseHypotheses]
     result: Case | PkmcalError
+
+
+def localization_share(session: Session) -> float:
+    """Share of a calibration's time that the localization of its images takes, about."""
+    by_hand = [station.handheld for station in session.stations]
+    return 0.25 + 0.5 * sum(by_hand) / max(len(by_hand), 1)
 
 
 def localize_case(
@@ -163,7 +196,7 @@ def search_by_hand(
     progress: Progress = no_progress,
 ) -> tuple[dict[int, PoseHypotheses], PriorScene]:
     """Pose hypotheses of each hand-held image, by station number, and the scene with accepted
-    poses.
+    poses; from the cache where the same images were localized before.
 
     T_camera_base of the scene is NaN for images without an accepted pose.
 
@@ -172,63 +205,111 @@ def search_by_hand(
         the others.
     progress : called with the step as text and the share done.
     """
+    name = session_name(session, [p.station for p in images], boards, scene)
+    localized = remembered_session(name, session.machine)
+    if localized is None:
+        localized = _searched(session, images, boards, scene, progress)
+        remember_session(name, localized)
+    return localized
+
+
+def _searched(
+    session: Session,
+    images: list[StationImages],
+    boards: Boards,
+    scene: PriorScene,
+    progress: Progress,
+) -> Localized:
+    """Localization by :func:`search_by_hand`, without the cache."""
     first = np.zeros(1, dtype=int)  # one image represents a camera on a tripod
     at = {p.station: p.select(first) for p in images}
-    by_hand = [k for k in at if session.stations[k].handheld]
-    room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
+    stated, scene = _with_stated(session, scene, at)
+    by_hand = [k for k in at if session.stations[k].handheld and k not in stated]
+    room = Surroundings(list(at), lambda k: (at[k].images[0], at[k].camera))
     answers: dict[int, _CachedHypotheses] = {}
-    drawn = so_far = _LocalizationState(scene)
+    so_far = _LocalizationState(scene)
 
     def hypotheses() -> dict[int, PoseHypotheses]:
-        return {k: answer.places for k, answer in answers.items() if answer.scores is not None}
+        scored = {k: answer.places for k, answer in answers.items() if answer.scores is not None}
+        return stated | scored
 
-    def rescore(some: Sequence[int]) -> None:
+    def rescore(some: Sequence[int], text: str, progress: Progress) -> None:
+        progress(text, 0.0)
         search = partial(_search, session, room, so_far)
         now = pool.map(search, [at[k] for k in some], [answers[k] for k in some])
-        answers.update(zip(some, now, strict=True))
+        for done, (k, one) in enumerate(zip(some, now, strict=True), start=1):
+            answers[k] = one
+            progress(f"{text}: {done} of {len(some)}", done / len(some))
 
     def believed() -> Array:
-        return _believed(hypotheses(), len(by_hand), boards, scene.T_camera_base)
+        return _believed(hypotheses(), len(by_hand) + len(stated), boards, scene.T_camera_base)
 
     with ThreadPoolExecutor(THREADS) as pool:
         # each image by itself
-        alone = pool.map(partial(_image_hypotheses, session, scene), [at[k] for k in by_hand])
+        alone = pool.map(partial(_alone, session, scene), [at[k] for k in by_hand])
         for k, one in zip(by_hand, alone, strict=True):
             answers[k] = _CachedHypotheses(one, one)
             done = len(answers)
             progress(
-                f"Localizing images by hand: {done} of {len(by_hand)}", 0.4 * done / len(by_hand)
+                f"Localizing images by hand: {done} of {len(by_hand)}", 0.3 * done / len(by_hand)
             )
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
-        half = (len(clearer) + 1) // 2
-        progress(f"Scoring the {half} least ambiguous of {len(by_hand)} images", 0.4)
-        rescore(clearer[:half])
+        half = min((len(clearer) + 1) // 2, _OPTIONS.most_from_nominal)
+        rescore(clearer[:half], "Scoring the least ambiguous images", part(progress, 0.3, 0.5))
         so_far = _with_sure(session, at, room, so_far, believed(), boards)
-        progress(f"Scoring the others, with {len(so_far.placed)} images localized", 0.55)
-        rescore(clearer[half:])
-        # join the images of a board, and repeat until no image is added
+        text = f"Scoring the others, with {len(so_far.placed)} images localized"
+        rescore(clearer[half:], text, part(progress, 0.55, 0.7))
+        # join the images of a board, and score images without an accepted pose again
         for k, one in _on_board(hypotheses(), boards).items():
             answers[k] = replace(answers[k], places=one)
-        before, so_far = drawn, _with_sure(session, at, room, so_far, believed(), boards)
-        rest = part(progress, 0.6, 1)
-        while so_far.scene is not before.scene:
-            before, T = so_far, believed()
+        so_far = _with_sure(session, at, room, so_far, believed(), boards)
+        rest = part(progress, 0.75, 1)
+        for _ in range(_OPTIONS.most_rounds):
+            T = believed()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
+            if not so_far.placed or not unsure:
+                break
             placed = len(by_hand) - len(unsure)
-            rest = part(rest, 0.3, 1)
-            rest(f"Scoring again, with {placed} of {len(by_hand)} images localized", 0)
-            rescore(unsure)
+            text = f"Scoring again, with {placed} of {len(by_hand)} images localized"
+            rescore(unsure, text, part(rest, 0, 0.4))
             so_far = _with_sure(session, at, room, so_far, believed(), boards)
-    # accepted poses, by the joint estimate where it has them
-    out = believed()
+            rest = part(rest, 0.5, 1)
+    out = _placed_at(so_far, believed(), (*by_hand, *stated))
+    untested = tuple(_untested(session, so_far, answers, out))
+    return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
+
+
+def _with_stated(
+    session: Session, scene: PriorScene, at: Mapping[int, StationImages]
+) -> tuple[dict[int, PoseHypotheses], PriorScene]:
+    """Hand-held images whose pose the session states: the likeliest pose near it, alone, by
+    station; and the scene with these poses.
+    """
+    T_camera_base = scene.T_camera_base.copy()
+    stated: dict[int, PoseHypotheses] = {}
+    for k, p in at.items():
+        T = session.stations[k].T_camera_base
+        if T is None or not session.stations[k].handheld:
+            continue
+        view = finest_view(scene.machine, p, session.joints, scene.T_base_platform)
+        near = localize_near(view, p.images[0], T)
+        stated[k] = PoseHypotheses(near.T_camera_base[:1], near.log_likelihood_ratio[:1], near.unit)
+        T_camera_base[k] = near.T_camera_base[0]
+    return stated, scene._replace(T_camera_base=T_camera_base)
+
+
+def _placed_at(so_far: _LocalizationState, believed: Array, by_hand: Sequence[int]) -> Array:
+    """T_camera_base (S, 4, 4) in the end: estimated for registered images, NaN for those that are
+    not accepted any more and where too few legs can be measured.
+    """
+    out = believed.copy()
     for k in by_hand:
-        if k in so_far.scene.edges:
+        if k in so_far.scene.edges and not np.isnan(out[k]).any():
             out[k] = so_far.scene.T_camera_base[k]
         elif k in so_far.bare:
             out[k] = np.nan
-    untested = tuple(_untested(session, so_far, answers, out))
-    return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
+    return out
 
 
 def _untested(
@@ -273,6 +354,7 @@ class _CachedHypotheses:
     scores : by the joint estimate, None before it.
     by : marginal prior of the machine at that time, None for the nominal model.
     beside : number of images that determined the machine.
+    anew : whether ``hypotheses`` are by a machine from images.
     """
 
     hypotheses: PoseHypotheses
@@ -280,6 +362,7 @@ class _CachedHypotheses:
     scores: ScoredPoses | None = None
     by: MarginalPrior | None = None
     beside: int = 0
+    anew: bool = False
 
 
 def _with_sure(
@@ -311,9 +394,9 @@ def _with_sure(
         )
         if bare == new.keys():
             return so_far._replace(bare=bare) if bare != so_far.bare else so_far
-        if bare:
-            rest = {k: T for k, T in new.items() if k not in bare}
-            joined = register_images(session, images, scene, rest, boards)
+        if bare:  # the others again, from where they are now
+            rest = {k: edges for k, edges in joined.edges.items() if k not in bare}
+            joined = register_images(session, images, joined._replace(edges=rest), {}, boards)
         scene = joined
     except PkmcalError as error:
         return so_far._replace(failure=str(error))
@@ -333,14 +416,29 @@ def _too_few_edges(scene: PriorScene, image: StationImages) -> bool:
     return len(visible) < min(_OPTIONS.fewest_legs, machine.n_legs)
 
 
-def _image_hypotheses(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
-    """Pose hypotheses from one image alone."""
+def _alone(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
+    """Pose hypotheses from one image alone, from the cache where it was localized before."""
+    name = image_name(session, scene.machine, image.station)
+    hypotheses = remembered_image(name)
+    if hypotheses is None:
+        hypotheses = _image_hypotheses(session, scene, image)
+        remember_image(name, hypotheses)
+    return hypotheses
+
+
+def _image_hypotheses(
+    session: Session, scene: PriorScene, image: StationImages, wider: int = 1
+) -> PoseHypotheses:
+    """Pose hypotheses from one image alone.
+
+    wider : factor on the number of hypotheses that are refined.
+    """
     p = image
     view = StationView(
         scene.machine, p.camera, p.configuration, session.joints, scene.T_base_platform,
         distance_tables([p.images[0]]),
     )  # fmt: skip
-    return localize_image(view, p.images[0])
+    return localize_image(view, p.images[0], IMAGE_LOCALIZATION_OPTIONS.wider(wider))
 
 
 def _search(
@@ -353,31 +451,49 @@ def _search(
     """Pose hypotheses of an image, weighted by its legs and by the background.
 
     The background is compared with that of the images with accepted poses; earlier hypotheses are
-    among the candidates. Once images have determined the machine, the image is localized by itself
-    once more; later images change the machine little. Poses that were scored with a similar machine
-    are not scored again.
+    among the candidates. An image that stays ambiguous is localized with the first machine from
+    images: by itself once more, among more hypotheses, because later images change the machine
+    little, and by the background of each of its neighbours. Poses that were scored with a similar
+    machine are not scored again.
     """
     p, scene, placed, k = image, so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
-    # localize anew with the first machine from images; reuse the scores of a similar machine
-    if scene.prior is not None:
-        if before.by is None:
-            alone = _image_hypotheses(session, scene, p)
-        elif len(placed) < _OPTIONS.rescoring_growth * before.beside and scene.prior.like(
-            before.by
-        ):
-            scores, by, beside = before.scores, before.by, before.beside
+    anew = before.anew or (scene.prior is not None and before.scores is not None)
+    if anew and not before.anew:
+        alone = _image_hypotheses(session, scene, p, _OPTIONS.wider)
+    elif (
+        scene.prior is not None
+        and before.by is not None
+        and len(placed) < _OPTIONS.rescoring_growth * before.beside
+        and scene.prior.like(before.by)
+    ):
+        scores, by, beside = before.scores, before.by, before.beside
     # further candidates: from landmarks, from the last scoring, and from the background
     likely = before.places.T_camera_base[: _OPTIONS.scored_again]
     others = np.concatenate([room.place(k, so_far.landmarks), likely])
     if placed:
         axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
+    if placed and anew:
+        others = np.concatenate([others, _by_neighbours(session, room, so_far, p)])
     # joint estimate, then the background
     closer, scores = rescore_poses(session, p, scene, alone, others, scores)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
-    return _CachedHypotheses(alone, places, scores, by, beside)
+    return _CachedHypotheses(alone, places, scores, by, beside, anew)
+
+
+def _by_neighbours(
+    session: Session, room: Surroundings, so_far: _LocalizationState, image: StationImages
+) -> Array:
+    """Poses (n, 4, 4) of an image by the background of each of its neighbours, at the distance
+    from it at which the legs match best.
+    """
+    p, scene = image.decoded(), so_far.scene
+    away = [np.linalg.norm(one.T_camera_base[:3, 3]) for one in so_far.placed.values()]
+    lines = room.relative(p.station, so_far.placed, _OPTIONS.apart * float(np.median(away)))
+    view = finest_view(scene.machine, p, session.joints, scene.T_base_platform)
+    return localize_along(view, lines, legs.LEG_SEARCH_OPTIONS.sigma)
 
 
 def _legs(

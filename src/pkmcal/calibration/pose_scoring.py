@@ -16,22 +16,19 @@ in a cluttered image a chance match of a leg matches all of it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import THREADS, Array
+from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import PriorScene
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.bundle import bundle, marginalize_to_machine
-from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
+from pkmcal.identify.bundle import Fit, fit_state, marginalize_to_machine
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import EdgeSet, Measurements, of_stations
+from pkmcal.measurements import EdgeSet, of_stations
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.image_localization import (
@@ -62,6 +59,9 @@ class PoseScoringOptions:
     most_behind_best: float = 12.0
     # number of poses that are refined locally, once other images have determined the machine
     refined_locally: int = 4
+    # ratio by which the number of images that determine the machine must grow before likelier poses
+    # are searched around those of all of them, instead of the new ones only
+    refined_again_growth: float = 1.25
     # measurement passes of silhouettes, each from the previous estimate: from the nominal model,
     # which has errors of pixels, and from a machine that images have determined
     passes_from_nominal: int = 4
@@ -100,21 +100,20 @@ def register_images(
 
     n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
     every = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
-    near = {
-        k: refine_local(view(k, scene), T, _OPTIONS.silhouette_scatter)[0] for k, T in every.items()
+    again = len(every) >= _OPTIONS.refined_again_growth * len(scene.edges)
+    near = every | {
+        k: refine_local(view(k, scene), T, _OPTIONS.silhouette_scatter)[0]
+        for k, T in (every if again else places).items()
     }
     updated_scene = scene._replace(prior=None)
     while True:
-        last = _measurement_pass(session, updated_scene, near, boards, view)
+        last, fit = _measurement_pass(session, updated_scene, near, boards, view)
         # scatter of the silhouettes from their residuals, relative to the stated sigmas
-        statistics = last.estimate.statistics
-        freedom = statistics.dof_edges
-        share = statistics.chi2_edges / freedom if freedom > LEAST_NOISE_FREEDOM else 1.0
-        updated_scene = last.scene._replace(scatter=updated_scene.scatter * float(np.sqrt(share)))
+        updated_scene = last._replace(scatter=updated_scene.scatter * fit.edge_scale)
         near = {k: updated_scene.T_camera_base[k] for k in near}
         n_passes -= 1
         if not n_passes:
-            return updated_scene._replace(prior=marginalize_to_machine(last.estimate))
+            return updated_scene._replace(prior=marginalize_to_machine(fit.info))
 
 
 def evaluate_pose(
@@ -135,19 +134,9 @@ def evaluate_pose(
 
     paid = 0.0
     for _ in range(_OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal):
-        last = _measurement_pass(session, scene, {station: T_camera_base}, Boards(), changed)
-        scene, statistics = last.scene, last.estimate.statistics
-        T_camera_base = scene.T_camera_base[station]
-        paid = (statistics.chi2_drawing + statistics.chi2_joints) / 2
+        scene, fit = _measurement_pass(session, scene, {station: T_camera_base}, Boards(), changed)
+        T_camera_base, paid = scene.T_camera_base[station], fit.change
     return scene, paid
-
-
-class _Pass(NamedTuple):
-    """Result of a measurement pass: scene, measurements and estimate."""
-
-    scene: PriorScene
-    measurements: Measurements
-    estimate: Estimate
 
 
 def _measurement_pass(
@@ -156,7 +145,7 @@ def _measurement_pass(
     places: Mapping[int, Array],
     boards: Boards,
     view: ViewOf,
-) -> _Pass:
+) -> tuple[PriorScene, Fit]:
     """Measure silhouettes from the given poses and estimate the scene.
 
     Other images enter by the marginal prior of the machine only.
@@ -166,23 +155,20 @@ def _measurement_pass(
     def measure(k: int) -> EdgeSet:
         return silhouette_edges(view(k, scene), places[k], k).edges.scaled(scene.scatter)
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        edges = dict(zip(stations, pool.map(measure, stations), strict=True))
+    edges = {k: measure(k) for k in stations}
     # joint estimate of these stations alone
     only = replace(session.of_stations(stations), trackers=(), links=())
     visible = boards.of(np.array(stations, dtype=int))
     numbered = of_stations({n: edges[k] for n, k in enumerate(stations)})
     measurements = measurements_of(only, visible, numbered)
     start = start_state(scene.machine, measurements, np.stack([places[k] for k in stations]))
-    estimate = bundle(session.machine, measurements, start, marginal_prior=scene.prior)
+    fit = fit_state(session.machine, measurements, start, scene.prior)
     # results back into the scene of all stations
     at = scene.T_camera_base.copy()
-    at[stations] = estimate.state.T_camera_base
-    poses = estimate.state.T_base_platform
-    now = scene._replace(
-        machine=estimate.machine, T_camera_base=at, T_base_platform=poses, edges=edges
-    )
-    return _Pass(now, measurements, estimate)
+    at[stations] = fit.state.T_camera_base
+    poses = fit.state.T_base_platform
+    now = scene._replace(machine=fit.machine, T_camera_base=at, T_base_platform=poses, edges=edges)
+    return now, fit
 
 
 class ScoredPoses(NamedTuple):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -45,8 +45,9 @@ from pkmcal.measurements import (
 from pkmcal.measurements.effects import FOCAL_EXCESS, INTRINSICS
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
+from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.image_batches import StationImages, placed_at
-from pkmcal.observe.image_localization import finest_view
+from pkmcal.observe.image_localization import finest_tables, finest_view
 from pkmcal.observe.images import CACHED_IMAGE_BYTES
 from pkmcal.observe.profiles import PROFILE_OPTIONS, BlurByStation
 from pkmcal.observe.quality import quality
@@ -102,6 +103,8 @@ class RefinementOptions:
 
 
 REFINEMENT = RefinementOptions()
+
+Result = TypeVar("Result")
 
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
 _OFF = (
@@ -244,7 +247,7 @@ def _responses(
         """Edges of some images by another response, measured where ``before`` predicts them."""
         lap("identify")
         measure = partial(_measure, estimate=before, blur=blur, refine=cameras.active)
-        edges = concatenate([one.edges for one in _search_pass(some, measure)])
+        edges = concatenate([combine_repeats(one).edges for one in _search_pass(some, measure)])
         lap("observe")
         return edges
 
@@ -279,20 +282,26 @@ def imputation_variance(
     by_hand = any(session.stations[p.station].handheld for p in turns.images)
     if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
         return turns
-    # estimates from edges that drawn machines predict
+    # edges that drawn machines predict
+    machines = list(_as_likely(session, estimate, options.imputations, rng))
+    cameras = [turns.cameras.updated(drawn) for drawn in machines]
+    predictions = [
+        _Prediction(drawn, [replace(p, camera=own.at_station(p.station)) for p in turns.images])
+        for drawn, own in zip(machines, cameras, strict=True)
+    ]
+    total = sum(len(p.images) for p in turns.images) * len(predictions)
+    done = _counted(part(progress, 0, 0.5), "Measuring edges from drawn machines", total)
+    active = turns.cameras.active
+    passes = _measurement_passes(session, predictions, turns.blur, turns.scatter, active, done)
+    # and the estimates from them
     offsets: list[Array] = []
     failures: list[str] = []
-    for number, drawn in enumerate(_as_likely(session, estimate, options.imputations, rng)):
-        text = f"Measuring edges from a drawn machine: {number + 1} of {options.imputations}"
-        progress(text, number / options.imputations)
-        cameras = turns.cameras.updated(drawn)
-        images = [replace(p, camera=cameras.at_station(p.station)) for p in turns.images]
+    for number, (drawn, own, one) in enumerate(zip(machines, cameras, passes, strict=True)):
+        text = f"Identifying from a drawn machine's edges: {number + 1} of {len(predictions)}"
+        progress(text, 0.5 + 0.5 * number / len(predictions))
         try:
-            passes = _measurement_pass(
-                session, images, drawn, turns.blur, turns.scatter, cameras.active
-            )
-            edges = _edges(passes, options)
-            measurements = measurements_of(session, case.boards, edges, cameras, estimate)
+            edges = _edges(one, options)
+            measurements = measurements_of(session, case.boards, edges, own, estimate)
             ended = bundle(session.machine, measurements, _without_camera_changes(drawn.state))
         except (PkmcalError, np.linalg.LinAlgError) as error:
             failures.append(str(error))
@@ -352,6 +361,13 @@ def _variance(changes: Array, estimate: Estimate) -> float:
     return float(np.mean(np.sum((changes @ white) ** 2, axis=1))) / trace
 
 
+class _Prediction(NamedTuple):
+    """Estimate that predicts edges, and the images of all stations with its cameras."""
+
+    estimate: Estimate
+    images: Sequence[StationImages]
+
+
 def _measurement_pass(
     session: Session,
     images: Sequence[StationImages],
@@ -362,13 +378,35 @@ def _measurement_pass(
     done: legs.ImageBatchesInUse | None = None,
 ) -> list[legs.StationEdges]:
     """Edges of all images, measured where the estimate predicts them."""
-    whole = partial(_with_silhouettes, session, estimate, scatter, refine)
+    return _measurement_passes(
+        session, [_Prediction(estimate, images)], blur, scatter, refine, done
+    )[0]
 
-    def station_edges(some: Sequence[StationImages]) -> list[legs.StationEdges]:
-        passes = _measure(some, estimate, blur, refine, done)
-        return [whole(p, one) for p, one in zip(some, passes, strict=True)]
 
-    return _search_pass(images, station_edges)
+def _measurement_passes(
+    session: Session,
+    predictions: Sequence[_Prediction],
+    blur: BlurByStation,
+    scatter: float,
+    refine: bool,
+    done: legs.ImageBatchesInUse | None = None,
+) -> list[list[legs.StationEdges]]:
+    """Edges of all images, by estimate, measured where each of the estimates predicts them."""
+    numbers = {p.station: n for n, p in enumerate(predictions[0].images)}
+    estimates = [prediction.estimate for prediction in predictions]
+
+    def measure(some: Sequence[StationImages]) -> list[list[legs.StationEdges]]:
+        own = [[prediction.images[numbers[p.station]] for p in some] for prediction in predictions]
+        passes = [
+            _measure(images, prediction.estimate, blur, refine, done)
+            for prediction, images in zip(predictions, own, strict=True)
+        ]
+        whole = partial(_with_silhouettes, session, estimates, scatter, refine)
+        with ThreadPoolExecutor(THREADS) as pool:  # distance tables take most of the time
+            return list(pool.map(whole, zip(*own, strict=True), zip(*passes, strict=True)))
+
+    stations = _search_pass(predictions[0].images, measure)
+    return [[combine_repeats(one[n]) for one in stations] for n in range(len(predictions))]
 
 
 def _checked_pass(
@@ -576,7 +614,7 @@ def _first_estimate(
     ):
         done = _counted(part(progress, share, share + 0.5), text, total)
         search = partial(_whole_legs, scene=scene, reach=reach, done=done, options=options.search)
-        passes = _search_pass(images, search)
+        passes = [combine_repeats(one) for one in _search_pass(images, search)]
         measurements = measurements_of(session, boards, _edges(passes, options))
         lap("observe")
         start = start or begin(measurements)
@@ -624,9 +662,29 @@ def _measure(
 
 def _with_silhouettes(
     session: Session,
-    estimate: Estimate,
+    estimates: Sequence[Estimate],
     scatter: float,
     refine: bool,
+    images: Sequence[StationImages],
+    edges: Sequence[legs.StationEdges],
+) -> list[legs.StationEdges]:
+    """Edges of one station, by estimate; of a hand-held image with coarse silhouettes.
+
+    images : of the station, with the cameras of each estimate. The distance tables depend on none.
+    """
+    if not session.stations[images[0].station].handheld:
+        return [*edges]
+    tables = finest_tables(images[0])
+    complete = partial(_completed, session, scatter, refine, tables)
+    return [complete(*one) for one in zip(estimates, images, edges, strict=True)]
+
+
+def _completed(
+    session: Session,
+    scatter: float,
+    refine: bool,
+    tables: DistanceTables,
+    estimate: Estimate,
     images: StationImages,
     edges: legs.StationEdges,
 ) -> legs.StationEdges:
@@ -635,10 +693,8 @@ def _with_silhouettes(
     The pose of such an image is determined by its own few edges, so none should be missing. scatter
     : ratio of the standard deviation of the coarse edges to the stated one.
     """
-    if not session.stations[images.station].handheld:
-        return edges
     state = estimate.state
-    view = finest_view(estimate.machine, images, session.joints, state.T_base_platform)
+    view = finest_view(estimate.machine, images, session.joints, state.T_base_platform, tables)
     T_camera_base = state.T_camera_base[images.station]
     coarse = silhouette_edges(view, T_camera_base, images.station, refine)
 
@@ -666,19 +722,19 @@ def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
 
 def _search_pass(
     images: Sequence[StationImages],
-    measure: Callable[[Sequence[StationImages]], list[legs.StationEdges]],
+    measure: Callable[[Sequence[StationImages]], list[Result]],
     cached_bytes: float = CACHED_IMAGE_BYTES,
-) -> list[legs.StationEdges]:
-    """Edges of all stations, repeats combined.
+) -> list[Result]:
+    """Results of ``measure`` for all stations.
 
     Stations are measured together, or in parallel where their images must be decoded, which
     releases the interpreter's lock: those that need more than ``cached_bytes`` bytes.
     """
     pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in images)
     if pixels <= cached_bytes:
-        return [combine_repeats(one) for one in measure(images)]
+        return measure(images)
     with ThreadPoolExecutor(THREADS) as pool:
-        return [combine_repeats(one) for (one,) in pool.map(measure, ([p] for p in images))]
+        return [one for (one,) in pool.map(measure, ([p] for p in images))]
 
 
 def _edges(passes: list[legs.StationEdges], options: RefinementOptions) -> EdgeSet:

@@ -24,7 +24,7 @@ from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import Case
 from pkmcal.calibration.discrepancy_basis import discrepancy_findings, explains_heights
 from pkmcal.calibration.faults import turning
-from pkmcal.calibration.handheld import Localization, localize
+from pkmcal.calibration.handheld import Localization, localization_share, localize
 from pkmcal.calibration.leg_numbering import numbering_note
 from pkmcal.calibration.localization import (
     board_images,
@@ -260,18 +260,19 @@ def _check_images(
     if lost and any(station.T_camera_base is None for station in session.stations):
         return _ImageChecks(_unsearched(session, images), boards.findings)
     turn_findings = () if lost else pose_findings(session, boards.boards)
+    share = localization_share(session)
     located = localize(  # with the random numbers of `calibrate`
         session,
         whole,
         boards.boards,
         np.random.default_rng(seed),
-        part(progress, 0, 0.3),
+        part(progress, 0, share),
     )
     settled: Settled | PkmcalError | None = None
     if isinstance(located.result, PkmcalError):
         settled = located.result
     elif not lost and not any(finding.level is Level.WRONG for finding in turn_findings):
-        settled = _calibration_start(session, located.result, seed, progress)
+        settled = _calibration_start(session, located.result, seed, part(progress, share, 1))
     case = located.result if not isinstance(settled, Settled) else settled.case
     rejected = () if isinstance(case, PkmcalError) else case.session.rejected
     findings = [
@@ -342,7 +343,7 @@ def _calibration_start(
 ) -> Settled | PkmcalError:
     """Start of a calibration as `calibrate` computes it, or the error with which it would end."""
     try:
-        return settle(session, case, False, seed, Clock(part(progress, 0.3, 1)))
+        return settle(session, case, False, seed, Clock(progress))
     except PkmcalError as error:
         return error
 

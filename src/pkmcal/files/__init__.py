@@ -1,6 +1,7 @@
 """Files in and out: YAML with line numbers, schemas, CSV tables, outputs whole or not at all."""
 
 from pkmcal.files.cache import remember, remembered
+from pkmcal.files.cached_arrays import digest_of, remember_arrays, remembered_arrays
 from pkmcal.files.documents import (
     Document,
     Keys,
@@ -98,6 +99,7 @@ __all__ = [
     "closest",
     "csv_text",
     "default_output",
+    "digest_of",
     "entries",
     "field_path",
     "json_text",
@@ -116,7 +118,9 @@ __all__ = [
     "read_text",
     "read_yaml",
     "remember",
+    "remember_arrays",
     "remembered",
+    "remembered_arrays",
     "remove_folder",
     "resolved",
     "sensor_size",

@@ -6,6 +6,7 @@ The program works without the folder: where it cannot be read or written, result
 from __future__ import annotations
 
 import os
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -21,7 +22,7 @@ def remembered(name: str) -> bytes | None:
 def remember(name: str, content: bytes) -> None:
     """Cache content, whole or not at all, readable by this user alone: it may be code, or a key."""
     place = cache_folder()
-    new = place / f"{name}.{os.getpid()}"
+    new = place / f"{name}.{os.getpid()}-{threading.get_ident()}"
     with suppress(OSError):
         place.mkdir(parents=True, exist_ok=True, mode=0o700)
         try:

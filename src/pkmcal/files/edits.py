@@ -21,6 +21,10 @@ MAPPING_INDENT = 2
 """Columns by which a new mapping stands in its parent."""
 
 
+_Entry = Mapping[str, "_Entry"] | Sequence[float]
+"""List of numbers, or a mapping of these."""
+
+
 class _Change(NamedTuple):
     """Replacement of the characters start to stop of a text."""
 
@@ -30,17 +34,23 @@ class _Change(NamedTuple):
 
 
 def with_numbers(
-    text: str, label: str, keys: tuple[str, ...], entry: Mapping[str, Sequence[float]]
+    text: str,
+    label: str,
+    keys: tuple[str, ...],
+    entry: Mapping[str, Sequence[float]],
+    *,
+    with_parent: bool = False,
 ) -> str:
     """Set lists of numbers in the mapping at `keys` of a YAML file; returns the new text.
 
     text : with the file's own line ends. keys : path of the mapping, which may be absent while its
     parent is present. Lists that are present are changed number by number, absent ones are added.
+    with_parent : the parent may be absent too, and is added.
     Raises InputError where this is not possible without a change of anything else.
     """
     before = parse_yaml(text, Path(label), label)
     edit = _Edit(text, before)
-    after = edit.done(keys, entry)
+    after = edit.done(keys, entry, with_parent)
     wanted = _with(before.data, keys, entry)
     # whatever is odd about a file: no other value of it may change
     if parse_yaml(after, Path(label), label).data != wanted:
@@ -52,7 +62,7 @@ def _with(data: Any, keys: tuple[str, ...], entry: Mapping[str, Sequence[float]]
     """Plain data with the entry inserted."""
     if not keys:
         return {**(data or {}), **{name: list(values) for name, values in entry.items()}}
-    return {**data, keys[0]: _with(data.get(keys[0]), keys[1:], entry)}
+    return {**(data or {}), keys[0]: _with((data or {}).get(keys[0]), keys[1:], entry)}
 
 
 @dataclass(frozen=True)
@@ -62,13 +72,18 @@ class _Edit:
     text: str
     document: Document
 
-    def done(self, keys: tuple[str, ...], entry: Mapping[str, Sequence[float]]) -> str:
+    def done(
+        self, keys: tuple[str, ...], entry: Mapping[str, Sequence[float]], with_parent: bool
+    ) -> str:
         """The text with the entry inserted."""
         root = compose_yaml(self.text)
         shared = _shared(root)
         parent = root
-        for key in keys[:-1]:
+        for depth, key in enumerate(keys[:-1]):
             child = self._child(parent, key)
+            last = depth == len(keys) - 2
+            if child is None and last and with_parent and isinstance(parent, yaml.MappingNode):
+                return self._changed_text(self._added(parent, shared, key, {keys[-1]: entry}))
             if child is None or id(child) in shared:
                 raise self.refused(keys, "it is merged or repeated (<<, &, *) from elsewhere")
             parent = child
@@ -84,6 +99,10 @@ class _Edit:
         else:  # null, written or not
             start, stop = _span(node)
             changes = [_Change(start, stop, " " * (start == stop) + _flow(entry))]
+        return self._changed_text(changes)
+
+    def _changed_text(self, changes: Sequence[_Change]) -> str:
+        """The text with changes made."""
         text = self.text
         for change in sorted(changes, reverse=True):
             text = text[: change.start] + change.text + text[change.stop :]
@@ -117,10 +136,10 @@ class _Edit:
         parent: yaml.MappingNode,
         shared: set[int],
         name: str,
-        value: Mapping[str, Sequence[float]] | Sequence[float],
+        value: _Entry,
     ) -> list[_Change]:
         """Addition of a last entry to a mapping, in the mapping's own style."""
-        inner = _flow(value) if isinstance(value, Mapping) else _row(value)
+        inner = _inline(value)
         if parent.flow_style:
             stop = parent.end_mark.index - 1
             start = _end(parent.value[-1][1]) if parent.value else stop
@@ -130,7 +149,7 @@ class _Edit:
         lines = [f"{indent}{name}: {inner}"]
         if isinstance(value, Mapping):
             deeper = indent + " " * MAPPING_INDENT
-            rows = [f"{deeper}{each}: {_row(numbers)}" for each, numbers in value.items()]
+            rows = [f"{deeper}{each}: {_inline(one)}" for each, one in value.items()]
             lines = [f"{indent}{name}:", *rows]
         eol = "\r\n" if "\r\n" in self.text else "\n"
         # an alias has the marks of what it stands for
@@ -203,5 +222,9 @@ def _row(values: Sequence[float]) -> str:
     return "[" + ", ".join(_number(value) for value in values) + "]"
 
 
-def _flow(entry: Mapping[str, Sequence[float]]) -> str:
-    return "{" + ", ".join(f"{name}: {_row(values)}" for name, values in entry.items()) + "}"
+def _flow(entry: Mapping[str, _Entry]) -> str:
+    return "{" + ", ".join(f"{name}: {_inline(one)}" for name, one in entry.items()) + "}"
+
+
+def _inline(value: _Entry) -> str:
+    return _flow(value) if isinstance(value, Mapping) else _row(value)

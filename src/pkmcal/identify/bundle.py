@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -554,6 +554,95 @@ def bundle(
     Raises ResultError if the search cannot start, is abandoned, or does not converge.
     """
     gauge = gauge or default_gauge(machine)
+    assembled, result = _assembled_fit(
+        machine,
+        measurements,
+        start,
+        gauge,
+        marginal_prior,
+        use_prior=use_prior,
+        robust=robust,
+        scale_noise=scale_noise,
+        scale_readings=scale_readings,
+        hopeless=hopeless,
+        options=options,
+    )
+    return _estimate(machine, measurements, start, assembled, result, gauge)
+
+
+class Fit(NamedTuple):
+    """Joint estimate without covariance.
+
+    machine : with the identified values. state : all unknowns, in the default gauge. change : half
+    the sum of squares by which the machine and the readings are changed, in their standard
+    deviations. edge_scale : factor on the edges' stated noise by their residuals; 1 for too few.
+    info : linearized at the state.
+    """
+
+    machine: Machine
+    state: State
+    change: float
+    edge_scale: float
+    info: Information
+
+
+def marginalize_to_machine(info: Information) -> MarginalPrior:
+    """Marginal prior of the machine from a linearized estimate, for the estimate of other
+    measurements.
+
+    The frames keep the nominal model's uncertainty, about their position in the estimate.
+    """
+    rows, _ = reduced_rows(info, ("machine",), silent=())
+    root: Array = np.asarray(np.linalg.qr(rows, mode="r"))
+    return MarginalPrior(info.state.z[0], root)
+
+
+def fit_state(
+    machine: Machine,
+    measurements: Measurements,
+    start: State,
+    marginal_prior: MarginalPrior | None = None,
+) -> Fit:
+    """Robust joint estimate without covariance, for trials; the readings' noise is as stated.
+
+    Arguments and errors are those of :func:`bundle`.
+    """
+    gauge = default_gauge(machine)
+    assembled, result = _assembled_fit(
+        machine, measurements, start, gauge, marginal_prior, scale_readings=False
+    )
+    problem = result.info.problem
+    state = in_gauge(machine, state_of(assembled, result.solution.state, start), gauge)
+    state = replace(state, theta=machine.parameters.unit_axes(state.theta))
+    identified = machine.with_values(state.theta)
+    value = result.info.by_kind.value
+    drawn = ~np.isin(assembled.priors, ("gauge", "mount"))
+    prior = problem.prior_values(result.info.state)[0] - problem.prior_target
+    change = np.sum(value[..., problem.closure_rows] ** 2) + np.sum(prior[drawn] ** 2)
+    edge_rows = problem.row_groups.edges.rows
+    chi2 = float(np.sum(result.edges.squares(problem.blocks, value[..., edge_rows])))
+    freedom = float(result.components.freedom[0, EDGE_ROWS])
+    scale = np.sqrt(chi2 / freedom) if freedom > LEAST_NOISE_FREEDOM else 1.0
+    state = _with_unseen_poses(identified, measurements, assembled, state)
+    info = Information(problem, batch_of(identified, replace(assembled, problem=problem), state))
+    return Fit(identified, state, float(change) / 2, float(scale), info)
+
+
+def _assembled_fit(
+    machine: Machine,
+    measurements: Measurements,
+    start: State,
+    gauge: Gauge,
+    marginal_prior: MarginalPrior | None,
+    *,
+    use_prior: bool = True,
+    hopeless: float = np.inf,
+    **options: Any,
+) -> tuple[Assembled, BatchResult]:
+    """The problem and its solution; ``options`` are those of :func:`solve_batch`.
+
+    Raises ResultError as :func:`bundle`.
+    """
     assembled = assemble(
         machine, measurements, gauge, use_prior=use_prior or marginal_prior is not None
     )
@@ -571,15 +660,7 @@ def bundle(
             marginal_prior.root @ marginal_prior.free,
         )
         problem = replace(problem, prior=prior, prior_target=target)
-    result = solve_batch(
-        problem,
-        batch,
-        robust=robust,
-        scale_noise=scale_noise,
-        scale_readings=scale_readings,
-        hopeless=hopeless,
-        options=options,
-    )
+    result = solve_batch(problem, batch, hopeless=hopeless, **options)
     # a failed search is an error, not a result
     if result.scale.poses[0] > hopeless:
         raise ResultError(
@@ -589,18 +670,7 @@ def bundle(
     stop = result.solution.stop[0]
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(what=f"the joint estimate failed: {stop.value}")
-    return _estimate(machine, measurements, start, assembled, result, gauge)
-
-
-def marginalize_to_machine(estimate: Estimate) -> MarginalPrior:
-    """Marginal prior of the machine from an estimate, for the estimate of other measurements.
-
-    The frames keep the nominal model's uncertainty, about their position in the estimate.
-    """
-    info = estimate.linearized.info
-    rows, _ = reduced_rows(info, ("machine",), silent=())
-    root: Array = np.asarray(np.linalg.qr(rows, mode="r"))
-    return MarginalPrior(info.state.z[0], root)
+    return assembled, result
 
 
 def _estimate(

@@ -54,23 +54,31 @@ class BackgroundOptions:
     # used: from the localization error of a feature to the camera rotation that a nominal model
     # wrong by millimetres causes
     spreads: tuple[float, ...] = (np.radians(0.1), np.radians(0.25), np.radians(0.6))
-    # number of shares of correct matches, from 2 to 98 %, of which the likeliest is used
-    # (numerical: steps of 2 %)
-    shares: int = 49
-    # number of random permutations of the partners from which the density of chance matches is
-    # estimated
-    exchanges: int = 20
-    # angle from the epipolar planes within which these are counted, rad: three times the largest
-    # spread
+    # smallest and largest share of correct matches
+    shares: tuple[float, float] = (0.02, 0.98)
+    # bisections of these to the likeliest share (numerical: to 1.5 %)
+    share_bisections: int = 6
+    # angle from the epipolar planes within which exchanged partners are counted, rad: three times
+    # the largest spread
     window: float = np.radians(2.0)
     # number of landmark triples tried by RANSAC for the pose of an image: a share of one correct
     # landmark in ten suffices to draw three correct ones (derived)
     triples: int = 3000
+    # largest number of sets of five matches tried by RANSAC for the relative pose of two images: a
+    # share of one correct match in four suffices (derived)
+    quintuples: int = 5000
     # cosine of rays to the optical axis below which they are left out of it: normalized
     # coordinates grow beyond bounds
     least_cosine: float = 0.2
     # number of candidate poses of an image around which the background is evaluated
     candidates: int = 4
+    # number of images with accepted poses, those with the most matches, that score a candidate
+    neighbours: int = 8
+    # number of images with which an image is matched: the most similar ones by the histograms of
+    # their features over a vocabulary
+    similar: int = 16
+    # words of the vocabulary, features drawn from all images
+    words: int = 256
     # largest rotation about the machine that is tried there, degrees; with larger ones the
     # silhouettes would match other legs
     turn_reach: float = 6.0
@@ -99,7 +107,7 @@ class Texture(NamedTuple):
 
     ray : (n, 3) unit vectors, camera frame.
     pixel : (n, 2).
-    descriptor : (n, 128).
+    descriptor : (n, 128) unit vectors.
     """
 
     ray: Array
@@ -131,29 +139,26 @@ def partners(
     """Indices (n, 2) of mutually nearest features that pass the ratio test, no image point used
     twice.
     """
-    import cv2
-
     if min(len(one.ray), len(other.ray)) < 2:
         return np.zeros((0, 2), dtype=int)
-    # mutual nearest neighbours, with their distance ratios
-    match = cv2.BFMatcher(cv2.NORM_L2)
-    there = match.knnMatch(one.descriptor, other.descriptor, k=2)
-    back = {m.queryIdx: m.trainIdx for m in match.match(other.descriptor, one.descriptor)}
-    mutual = [
-        (best.distance / max(second.distance, 1e-9), best.queryIdx, best.trainIdx)
-        for best, second in there
-        if back[best.trainIdx] == best.queryIdx
-    ]
+    # mutual nearest neighbours that pass the ratio test; descriptors have unit length
+    cosine = one.descriptor @ other.descriptor.T
+    rows = np.arange(len(cosine))
+    best, back = cosine.argmax(axis=1), cosine.argmax(axis=0)
+    nearest = cosine[rows, best]
+    cosine[rows, best] = -1
+    ratio = np.sqrt(np.maximum(1 - nearest, 0) / np.maximum(1 - cosine.max(axis=1), 1e-9))
+    j = rows[(back[best] == rows) & (ratio < options.distance_ratio)]
+    j = j[np.argsort(ratio[j], kind="stable")]
+    k = best[j]
     # best ratio first; a match near an accepted one, in either image, is the same point
-    pairs: list[tuple[int, int]] = []
-    taken = np.zeros((0, 2, 2))
-    for worth, j, k in sorted(mutual):
-        at = np.stack([one.pixel[j], other.pixel[k]])
-        away = np.abs(taken - at).max(axis=-1)
-        if worth < options.distance_ratio and (away >= options.apart).all():
-            pairs.append((j, k))
-            taken = np.concatenate([taken, at[None]])
-    return np.array(pairs, dtype=int).reshape(-1, 2)
+    near = np.zeros((len(j), len(j)), dtype=bool)
+    for pixel in (one.pixel[j], other.pixel[k]):
+        near |= np.abs(pixel[:, None] - pixel).max(axis=-1) < options.apart
+    taken = np.zeros(len(j), dtype=bool)
+    for n in range(len(j)):
+        taken[n] = not (near[n] & taken).any()
+    return np.stack([j, k], axis=1)[taken]
 
 
 def beside_machine(
@@ -188,7 +193,7 @@ def agreement(
     """Log-likelihood ratio that matched unit rays (n, 3) observe the same points, against chance.
 
     A match is either correct, with a share common to all matches, or distributed as matches with
-    permuted partners. The share and the spread of the correct matches are maximized over, and each
+    exchanged partners. The share and the spread of the correct matches are maximized over, and each
     costs half the logarithm of n (Schwarz, Annals of Statistics 6, 1978). Zero for fewer than
     the options' fewest matches.
 
@@ -200,18 +205,22 @@ def agreement(
     ray = one @ T_other_one[:3, :3].T
     normal = cross(np.broadcast_to(T_other_one[:3, 3], ray.shape), ray)
     normal /= np.maximum(np.sqrt(dot(normal, normal)), 1e-12)[:, None]
-    # angles from the planes, and their density by chance
-    rng = np.random.default_rng(0)
-    exchanged = other[np.stack([rng.permutation(len(other)) for _ in range(options.exchanges)])]
-    off, by_chance = (np.arcsin(np.clip(dot(normal, v), -1, 1)) for v in (other, exchanged))
-    chance = max(float(np.mean(np.abs(by_chance) < options.window)), 1 / by_chance.size) / (
-        2 * options.window
-    )
-    # maximum over share and spread, less the penalty of both
+    # angles from the planes, and their density by chance: that of all exchanged partners
+    sine = normal @ other.T
+    off = np.arcsin(np.clip(np.diagonal(sine), -1, 1))
+    np.fill_diagonal(sine, np.inf)
+    near = np.count_nonzero(np.abs(sine) < np.sin(options.window))
+    chance = max(near, 1) / (sine.size - len(sine)) / (2 * options.window)
+    # maximum over share and spread, less the penalty of both; the gain is concave in the share
     spread = np.array(options.spreads)[:, None]
     density = np.exp(-0.5 * (off / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
-    shares = np.linspace(0.02, 0.98, options.shares)[:, None, None]
-    gain = np.log1p(shares * (density / chance - 1)).sum(axis=-1)
+    excess = density / chance - 1
+    least, most = (np.full((len(spread), 1), share) for share in options.shares)
+    for _ in range(options.share_bisections):
+        share = (least + most) / 2
+        rises = np.sum(excess / (1 + share * excess), axis=1, keepdims=True) > 0
+        least, most = np.where(rises, share, least), np.where(rises, most, share)
+    gain = np.log1p((least + most) / 2 * excess).sum(axis=-1)
     return max(float(gain.max()) - np.log(len(one)), 0.0)
 
 
@@ -241,24 +250,63 @@ class Landmarks(NamedTuple):
 class Surroundings:
     """Features that the images of a session share with each other.
 
-    Features and matches are computed on first use and cached. The constructor takes a function that
-    returns the grey levels and the camera of the image with a given number.
+    Features and matches are computed on first use and cached. An image is matched with the most
+    similar other images only, so that the effort is linear in the number of images.
+
+    numbers : of the images. image : function that returns the grey levels and the camera of the
+    image with a given number.
     """
 
     def __init__(
         self,
+        numbers: Sequence[int],
         image: Callable[[int], tuple[Integers, Camera]],
         options: BackgroundOptions = BACKGROUND_OPTIONS,
     ) -> None:
-        self.options = options
+        self.numbers, self.options = numbers, options
         self.texture: Callable[[int], Texture] = cache(lambda k: texture_of(*image(k), options))
         self._pairs: Callable[[int, int], Integers] = cache(
             lambda j, k: partners(self.texture(j), self.texture(k), options)
         )
 
+    @cached_property
+    def _similar(self) -> frozenset[tuple[int, int]]:
+        """Pairs of images that are matched, the smaller number first.
+
+        Similarity is the cosine of their histograms over the vocabulary, words weighted by the
+        logarithm of their rarity (Sivic and Zisserman, ICCV 2003).
+        """
+        if len(self.numbers) <= self.options.similar + 1:
+            return frozenset(combinations(sorted(self.numbers), 2))
+        every = [self.texture(k).descriptor for k in self.numbers]
+        pool = np.concatenate(every)
+        drawn = np.random.default_rng(0).permutation(len(pool))[: self.options.words]
+        words = pool[drawn].T
+        count = (
+            np.stack(
+                [np.bincount((one @ words).argmax(axis=1), minlength=len(drawn)) for one in every]
+            )
+            if len(drawn)
+            else np.zeros((len(every), 1))
+        )
+        rarity = np.log(len(every) / np.maximum((count > 0).sum(axis=0), 1))
+        weight = count * rarity
+        weight = weight / np.maximum(np.sqrt(dot(weight, weight)), 1e-9)[:, None]
+        likeness = weight @ weight.T
+        np.fill_diagonal(likeness, -1)
+        nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : self.options.similar]
+        at = np.array(self.numbers)
+        return frozenset(
+            (min(one, other), max(one, other))
+            for one, others in zip(at.tolist(), at[nearest].tolist(), strict=True)
+            for other in others
+        )
+
     def shared(self, one: int, other: int) -> tuple[Integers, Integers]:
         """Indices (n,) of the matched features of two images, in each of them."""
         first, second = sorted((one, other))
+        if (first, second) not in self._similar:
+            return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
         pairs = self._pairs(first, second).T
         return (pairs[0], pairs[1]) if first == one else (pairs[1], pairs[0])
 
@@ -330,6 +378,40 @@ class Surroundings:
         rot = rotation(np.asarray(turn, dtype=float).ravel())
         return pose(rot, np.asarray(shift, dtype=float).ravel())[None]
 
+    def relative(self, one: int, placed: Mapping[int, Neighbour], apart: Array) -> Array:
+        """Camera poses T_camera_base (n, D, 4, 4) of an image by each of its nearest neighbours.
+
+        Two images determine their relative pose up to the distance of the cameras, for which the
+        values ``apart`` (D,), m, are used. Neighbours with too few matches are left out.
+        """
+        import cv2
+
+        out = [np.zeros((0, len(apart), 4, 4))]
+        off = float(np.tan(self.options.spreads[1]))
+        for other in self._nearest(one, placed):
+            j, k = self.shared(one, other)
+            rays = self.texture(one).ray[j], self.texture(other).ray[k]
+            ok = self._beside(other, k, placed[other])
+            for ray in rays:
+                ok &= ray[:, 2] > self.options.least_cosine
+            if np.count_nonzero(ok) < self.options.fewest_pairs:
+                continue
+            here, there = (np.ascontiguousarray(ray[ok, :2] / ray[ok, 2:]) for ray in rays)
+            essential, inside = cv2.findEssentialMat(
+                there, here, np.eye(3), cv2.RANSAC, 0.999, off, self.options.quintuples
+            )
+            if essential is None or essential.shape != (3, 3):  # no solution, or several
+                continue
+            _, turn, along, _ = cv2.recoverPose(essential, there, here, np.eye(3), mask=inside)
+            T = pose(np.asarray(turn, dtype=float), apart[:, None] * np.ravel(along))
+            out.append((T @ placed[other].T_camera_base)[None])
+        return np.concatenate(out)
+
+    def _nearest(self, one: int, placed: Mapping[int, Neighbour]) -> list[int]:
+        """Images with accepted poses that share the most features with an image."""
+        order = sorted(placed, key=lambda k: -len(self.shared(one, k)[0]))
+        return order[: self.options.neighbours]
+
     def about(
         self,
         hypotheses: PoseHypotheses,
@@ -353,7 +435,7 @@ class Surroundings:
             # rotations about the camera's axes x and y, through the middle of the machine
             turn = rotation(self.options.turns @ to_base[:3, :2].T)
             near = T @ pose(turn, middle - turn @ middle)
-            gain = self._gain(near, one, camera, [legs[h]] * len(near), placed)
+            gain = self._gain(near, one, camera, [legs[h]], placed)
             best = int(np.argmax(gain))
             if gain[best] > 0 and best != len(near) // 2:
                 out.append(near[best : best + 1])
@@ -396,24 +478,28 @@ class Surroundings:
     ) -> Array:
         """Log-likelihood ratio (H,) of camera poses by the background, against chance.
 
+        legs : for each of the poses, or one for all.
+
         Any of the images with accepted poses may be the one that shows the same part of the room,
         so their likelihoods are added.
         """
-        texture = self.texture(one)
-        gain = np.zeros((len(T_camera_base), len(placed)))
-        for n, (other, in_view) in enumerate(placed.items()):
+        texture, nearest = self.texture(one), self._nearest(one, placed)
+        gain = np.zeros((len(T_camera_base), len(nearest)))
+        outside = [
+            beside_machine(texture.pixel, camera, axes, options=self.options) for axes in legs
+        ]
+        for n, other in enumerate(nearest):
+            in_view = placed[other]
             j, k = self.shared(one, other)
             beside = self._beside(other, k, in_view)
             for h, T in enumerate(T_camera_base):
-                ok = beside & beside_machine(
-                    texture.pixel[j], camera, legs[h], options=self.options
-                )
+                ok = beside & outside[h % len(outside)][j]
                 rays = texture.ray[j[ok]], self.texture(other).ray[k[ok]]
                 gain[h, n] = agreement(
                     *rays, in_view.T_camera_base @ inverse(T), options=self.options
                 )
         # the best of several rotations and neighbours is chosen: the number of trials is paid for
-        tries = len(placed) * len(self.options.turns)
+        tries = len(nearest) * len(self.options.turns)
         return np.maximum(np.logaddexp.reduce(gain, axis=1) - np.log(tries), 0.0)
 
 

@@ -28,6 +28,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.distance_tables import (
     DISTANCE_TABLE_OPTIONS,
     DistanceTableOptions,
+    DistanceTables,
     distance_tables,
 )
 from pkmcal.observe.image_batches import StationImages
@@ -80,6 +81,8 @@ class ImageLocalizationOptions:
     on_finer: int = 120
     # number of hypotheses on the finest tables, besides the symmetric poses of the first two
     on_finest: int = 40
+    # number of poses of a line that are refined
+    on_line: int = 6
     # reaches of the steps of the first descent, reduced pixels, falling from the distance at which
     # an edge is attracted
     first_reaches: tuple[float, ...] = (16, 14, 12, 10)
@@ -94,7 +97,7 @@ class ImageLocalizationOptions:
     # the radius of the base. No real parts are exactly interchangeable, but in an image they look
     # so
     joint_distance: float = 0.2
-    # rounds of the search near a pose
+    # rounds of the search near a pose, which ends with the first that gains nothing
     near_rounds: int = 3
     # starts in each round
     near_starts: int = 32
@@ -119,6 +122,11 @@ class ImageLocalizationOptions:
         """Options of distance tables with a multiple of the usual resolution."""
         width = resolution * self.tables.width
         return replace(self.tables, width=width, directions=self.directions)
+
+    def wider(self, factor: int) -> ImageLocalizationOptions:
+        """Options with a multiple of the number of hypotheses."""
+        names = ("refined", "on_coarse", "on_finer", "on_finest")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
 
 
 IMAGE_LOCALIZATION_OPTIONS = ImageLocalizationOptions()
@@ -222,17 +230,24 @@ def distinct(view: StationView, values: Array) -> Integers:
     return rows[~same_pose(values[rows], values[0]) | (rows == 0)]
 
 
+def finest_tables(image: StationImages) -> DistanceTables:
+    """Distance tables of one image, at the largest resolution that is used."""
+    return distance_tables([image.images[0]], IMAGE_LOCALIZATION_OPTIONS.tables_at(4))
+
+
 def finest_view(
     machine: Machine,
     image: StationImages,
     joints: Array,
     poses: Array,
+    tables: DistanceTables | None = None,
 ) -> StationView:
     """View of one image with the finest tables.
 
     joints, poses : of all configurations of the session; the latter are T_base_platform.
+    tables : of the image, computed if None.
     """
-    tables = distance_tables([image.images[0]], IMAGE_LOCALIZATION_OPTIONS.tables_at(4))
+    tables = tables or finest_tables(image)
     return StationView(machine, image.camera, image.configuration, joints, poses, tables)
 
 
@@ -257,9 +272,31 @@ def refine_local(
         starts = starts[np.argsort(-log_likelihood_ratio)[: options.near_refined]]
         starts, log_likelihood_ratio = refine_ml(view, starts, one, 16, 10, scatter)
         k = int(np.argmax(log_likelihood_ratio))
-        if log_likelihood_ratio[k] > most:
-            best, most = starts[k], float(log_likelihood_ratio[k])
+        if log_likelihood_ratio[k] < most + view.options.least_gain:
+            break
+        best, most = starts[k], float(log_likelihood_ratio[k])
     return best, most
+
+
+def localize_along(
+    view: StationView,
+    T_camera_base: Array,
+    scatter: float,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> Array:
+    """Likeliest pose (N, 4, 4) of each of N lines of poses (N, D, 4, 4), such as a camera's at
+    unknown distance in a given direction.
+
+    view : with the finest tables. scatter : as of :func:`refine_local`.
+    """
+    one = np.zeros(1, dtype=int)
+    out = np.zeros((0, 4, 4))
+    for line in T_camera_base:
+        starts = _most(view, line, 8, options.on_line)
+        starts, log_likelihood_ratio = refine_ml(view, starts, one, 8, 6)
+        best = starts[np.argmax(log_likelihood_ratio)]
+        out = np.concatenate([out, refine_local(view, best, scatter)[0][None]])
+    return out
 
 
 def localize_near(

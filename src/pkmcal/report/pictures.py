@@ -100,7 +100,8 @@ def section(session: Session, album: Album) -> Part:
         parts += [
             Paragraph(
                 text="Rejected as a whole: these images do not show where they were taken from, and"
-                " nothing of them is in use. Lines: the nominal model at the most likely pose."
+                " nothing of them is in use. Lines: the nominal model at the most likely pose. A"
+                " hand-held image is used if pkmcal view saves its pose."
             ),
             blocks.Images(images=album.rejected),
         ]

@@ -57,6 +57,7 @@ from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats, without_temperature
 from pkmcal.session.schema import (
     BoardBody,
+    PoseDocument,
     SessionDocument,
     StationDocument,
     session_schema,
@@ -118,7 +119,10 @@ class RejectedStation:
     def finding(self) -> Finding:
         """Warning about the rejected station."""
         return doubtful(
-            "rejected.station", self.label, station=self.station.name, reason=self.reason
+            "rejected.image" if self.station.handheld else "rejected.station",
+            self.label,
+            station=self.station.name,
+            reason=self.reason,
         )
 
 
@@ -622,20 +626,16 @@ def _stations(
     T_camera_base = None
     if station.handheld:
         _check_handheld(document, name, station)
+    elif station.poses:
+        raise InputError(
+            "poses of single images belong to a hand-held camera",
+            where=document.where(*keys, "poses"),
+            found="poses, without handheld: true",
+            expected="pose, of a camera at one place",
+            next_step="Write pose for a camera on a tripod, or handheld: true",
+        )
     if station.pose is not None:
-        away = max(map(abs, station.pose.position))
-        if away > LARGEST_UNITLESS_LENGTH and not any_unit(document.data):
-            raise InputError(
-                "the camera's place looks like millimetres",
-                where=document.where(*keys, "pose", "position"),
-                found=f"{away:g} m",
-                expected=f"metres, at most {LARGEST_UNITLESS_LENGTH:g} where no value has a unit",
-                next_step="Write it with its unit, such as 1250 mm, or divide by 1000",
-            )
-        try:
-            T_camera_base = look_at(station.pose.position, station.pose.look_at, station.pose.up)
-        except InputError as error:
-            raise error.located(document.where(*keys, "pose")) from None
+        T_camera_base = _rough_pose(document, (*keys, "pose"), station.pose)
     whole = Station(
         name, camera, camera_file, T_camera_base, images, station.observe, name,
         station.handheld, from_exif, station.response or usual, station.response is not None,
@@ -643,11 +643,39 @@ def _stations(
     if not station.handheld:
         return [whole]
     check_count(len(images), MOST_HANDHELD_IMAGES, "images by hand", where)
+    called = ["-".join(filter(None, (names[one.configuration], one.repeat))) for one in images]
+    for image in station.poses.keys() - set(called):
+        raise InputError(
+            "there is no hand-held image of this name",
+            where=document.where(*keys, "poses", image),
+            found=image,
+            expected=closest(image, called) or "a configuration and a repeat, such as 0003-2",
+        )
+    poses = {
+        image: _rough_pose(document, (*keys, "poses", image), pose)
+        for image, pose in station.poses.items()
+    }
     return [
-        replace(whole, name="-".join(filter(None, called)), images=(image,))
-        for image in images
-        for called in [(name, names[image.configuration], image.repeat)]
+        replace(whole, name=f"{name}-{one}", images=(image,), T_camera_base=poses.get(one))
+        for one, image in zip(called, images, strict=True)
     ]
+
+
+def _rough_pose(document: Document, keys: Keys, pose: PoseDocument) -> Array:
+    """T_camera_base (4, 4) of a pose by hand."""
+    away = max(map(abs, pose.position))
+    if away > LARGEST_UNITLESS_LENGTH and not any_unit(document.data):
+        raise InputError(
+            "the camera's place looks like millimetres",
+            where=document.where(*keys, "position"),
+            found=f"{away:g} m",
+            expected=f"metres, at most {LARGEST_UNITLESS_LENGTH:g} where no value has a unit",
+            next_step="Write it with its unit, such as 1250 mm, or divide by 1000",
+        )
+    try:
+        return look_at(pose.position, pose.look_at, pose.up)
+    except InputError as error:
+        raise error.located(document.where(*keys)) from None
 
 
 def _check_handheld(document: Document, name: str, station: StationDocument) -> None:
@@ -659,7 +687,8 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
             where=document.where(*keys, "pose"),
             found="handheld: true, and a pose",
             expected="one of them",
-            next_step="Remove the pose, or handheld where all images are from one place",
+            next_step="Write it under poses, by the image's configuration and repeat, or remove"
+            " handheld where all images are from one place",
         )
     if "legs" not in station.observe:
         raise InputError(

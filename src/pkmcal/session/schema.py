@@ -62,6 +62,11 @@ class StationDocument(Schema):
     )
     pose: PoseDocument | None = None
     handheld: bool = False
+    poses: dict[str, PoseDocument] = Field(
+        default_factory=dict[str, PoseDocument],
+        description="rough poses of single hand-held images, by configuration and repeat such as"
+        " 0003-2",
+    )
     response: Response | None = Field(
         default=None,
         description="how the images code light: linear, as sensors count it, or srgb, as"

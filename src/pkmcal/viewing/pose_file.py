@@ -23,18 +23,14 @@ class PoseFile:
     def write(self, station: Station, T_camera_base: Array) -> str:
         """Write a station's pose and return a sentence about it.
 
-        Raises InputError for a hand-held camera, for a file that is a symbolic link (as in a copy
+        Raises InputError for a file that is a symbolic link (as in a copy
         of somebody else's session), for a file that somebody else has changed since it was last
         read, and for a pose that cannot be edited by itself.
         """
-        # images of a hand-held camera are localized one by one
-        keys = ("stations", station.entry, "pose")
-        if station.handheld:
-            raise InputError(
-                "a hand-held camera has no single pose to be written",
-                where=f"{SESSION_FILE_NAME}, {'.'.join(keys[:2])}",
-                next_step="Every such image is placed when you calibrate",
-            )
+        keys: tuple[str, ...] = ("stations", station.entry, "pose")
+        if station.handheld:  # each image has a pose of its own, by its name after the entry's
+            image = station.name.removeprefix(f"{station.entry}-")
+            keys = (*keys[:2], "poses", image)
         # one writer at a time; the file must be the one that this page read or wrote last
         with self._lock:
             if self._path.is_symlink():
@@ -58,9 +54,10 @@ class PoseFile:
                     " there once more",
                 )
             entry = place_of(T_camera_base)
-            changed = with_numbers(now.decode("utf-8"), SESSION_FILE_NAME, keys, entry).encode(
-                "utf-8"
+            text = with_numbers(
+                now.decode("utf-8"), SESSION_FILE_NAME, keys, entry, with_parent=station.handheld
             )
+            changed = text.encode("utf-8")
             if changed != now:
                 write_bytes(self._path, changed)
             self._last_bytes = changed

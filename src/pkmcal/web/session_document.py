@@ -25,7 +25,7 @@ class SessionStation(Schema):
     """Station with its images.
 
     legs : whether it can be localized by the legs in its images.
-    handheld : it has no one pose.
+    handheld : a single image by hand.
     posed : whether session.yaml has its pose.
     images : without overlays, which the page requests.
     """

@@ -294,7 +294,7 @@ class SessionView {
     this.inspector.element.classList.toggle("session-editing", !fixed && this.kind !== "pan");
     this.undoButton.disabled = fixed || !pose.undoable;
     this.fitButton.disabled = this.searchButton.disabled = fixed || !station.legs;
-    this.saveButton.disabled = fixed || station.handheld || !pose.changed;
+    this.saveButton.disabled = fixed || !pose.changed;
     this.saveButton.hidden = fixed;
     this.origin.textContent = fixed ? "As the calibration has it."
       : pose.changed ? "Moved; not in session.yaml."
@@ -569,8 +569,7 @@ class SessionView {
       event.preventDefault();
     });
     addEventListener("beforeunload", (event) => {
-      // the pose of a hand-held camera is not written
-      if (this.poses.some((pose, s) => pose.changed && !this.content.stations[s].handheld)) event.preventDefault();
+      if (this.poses.some((pose) => pose.changed)) event.preventDefault();
     });
     // the first image precedes the thumbnails; one that does not come has its reason in words
     this.inspector.element.addEventListener("load", () => this.list.load(), { capture: true, once: true });
