@@ -292,10 +292,14 @@ def imputation_variance(
     total = sum(len(p.images) for p in turns.images) * len(predictions)
     done = _counted(part(progress, 0, 0.5), "Measuring edges from drawn machines", total)
     active = turns.cameras.active
-    passes = _measurement_passes(session, predictions, turns.blur, turns.scatter, active, done)
-    # and the estimates from them
     offsets: list[Array] = []
     failures: list[str] = []
+    try:
+        passes = _measurement_passes(session, predictions, turns.blur, turns.scatter, active, done)
+    except (PkmcalError, np.linalg.LinAlgError) as error:
+        failures = [str(error)]
+        machines, cameras, passes = machines[:0], cameras[:0], list[list[legs.StationEdges]]()
+    # and the estimates from them
     for number, (drawn, own, one) in enumerate(zip(machines, cameras, passes, strict=True)):
         text = f"Identifying from a drawn machine's edges: {number + 1} of {len(predictions)}"
         progress(text, 0.5 + 0.5 * number / len(predictions))
