@@ -291,6 +291,5 @@ def _check_equations(document: MechanismDocument, place: PlaceInDocument) -> Non
         expected="one equation a leg with a length, one a revolute joint, one a pair of universal "
         f"joints with axes; {freedoms} for motion: {document.motion}"
         f"{f' and its {listed(kinds)}' if kinds else ''}",
-        next_step="Add legs or axes, or correct motion; a platform that its weight holds as well,"
-        " as on few cables, is not modelled",
+        next_step="Add legs or axes, or correct motion",
     )
