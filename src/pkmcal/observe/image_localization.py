@@ -71,7 +71,7 @@ class ImageLocalizationOptions:
     # number of image positions retained for each camera position and rotation
     positions: int = 2
     # number of hypotheses of the chart; in a cluttered laboratory the correct one is among the
-    # first thousand, with two of six legs hidden among the first five thousand (measured)
+    # first thousand, with two of six legs hidden among the first eight thousand (measured)
     charted: int = 8000
     # number of hypotheses that are refined
     refined: int = 2000
