@@ -151,6 +151,16 @@ def test_the_limits_of_a_verdict_are_its_options(whole):
     assert "data.misfit" in codes(too_noisy=np.nextafter(scale, 0))
 
 
+def test_edges_that_a_method_of_the_papers_leaves_far_off_are_its_own_misfit(whole):
+    observation, estimate, findings, _ = whole
+    noisy = VerdictOptions(too_noisy=np.nextafter(estimate.statistics.noise_scale, 0))
+    for method, other in (("bundle", "four-step"), ("four-step", "bundle")):
+        codes = assess(observation, estimate, findings, method=method, options=noisy).codes
+        expected = {"bundle": "data.misfit", "four-step": "estimate.method_misfit"}
+        assert expected[method] in codes
+        assert expected[other] not in codes
+
+
 def test_light_that_moves_single_edges_is_warned_of(whole):
     observation, estimate, findings, _ = whole
 

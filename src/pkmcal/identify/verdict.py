@@ -134,7 +134,8 @@ def assess(
     negligible = negligible_shift(estimate.machine.parameters)
     # edges that another method leaves far off, and heights that the bed explains
     by_method = method != "bundle" and estimate.statistics.noise_scale > options.too_noisy
-    without = ["edges"] * by_method + ["poses"] * explained
+    without = {"edges"} if by_method else set[str]()
+    without |= {"poses"} if explained else set()
     # all findings, in the order of the report
     every = (
         *_poor_estimate(estimate, method, by_method=by_method),

@@ -202,7 +202,7 @@ def _estimate(
             n_drawing=0,
             steps=0,
             stopped="closed form",
-            noise_scale=scale,
+            noise_scale=float(scale),
             chi2_poses=float(np.sum(poses**2)) / pose_scale**2,
             n_poses=n_poses,
             dof_poses=n_poses,
