@@ -7,12 +7,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
+from scipy.optimize import brentq, least_squares
 
+import pkmcal
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.cameras.pinhole import Pinhole
-from pkmcal.errors import InputError
+from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import parse_yaml, yaml_text
 from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
+from pkmcal.identify.tool import platform_sigma
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.pulley import Pulley, Spool
 from pkmcal.mechanisms.closure import closure, dense
@@ -261,3 +264,93 @@ def test_configurations_are_those_that_cables_allow(tmp_path):
         for other in (by_nominal, np.broadcast_to(truth.home(), poses.shape)):
             turn = np.linalg.norm(pose_difference(poses, other)[:, :3], axis=1)
             assert np.rad2deg(turn.max()) < 35
+
+
+def four_cables(folder, seed, n=24):
+    """Session of a platform on four cables whose every pose a tracker measured, and its true
+    anchors, joints and offsets.
+    """
+    rng = np.random.default_rng(seed)
+    anchors, joints = CORNERS[:4], JOINTS[:4]
+    legs = [
+        {
+            "base": {"joint": "spherical", "center": a.tolist()},
+            "platform": {"joint": "spherical", "center": b.tolist()},
+            "length": {"actuated": True, "range": [0.5, 8.0]},
+        }
+        for a, b in zip(anchors, joints, strict=True)
+    ]
+    document = {"name": "four", "motion": "spatial", "legs": legs}
+    document |= {
+        "home": {"position": [0.0, 0.0, 0.0]},
+        "tolerance": {"center": 0.01, "offset": 0.02},
+    }
+    true = anchors + rng.normal(0, 0.01, (4, 3)), joints + rng.normal(0, 0.01, (4, 3))
+    offsets = rng.normal(0, 0.02, 4)
+    poses = around_home(n, seed)
+    readings = lengths_at(poses, *true) - offsets + rng.normal(0, 2e-4, (n, 4))
+    T_tracker_base = pose(rotation(np.array([0.02, 0.01, 1.0])), np.array([0.5, -4.0, 1.0]))
+    noise = np.repeat([1e-4, 5e-5], 3) * rng.normal(size=(n, 6))
+    measured = perturb(T_tracker_base @ poses, noise)
+    turns = pose_difference(measured, pose(np.eye(3), measured[:, :3, 3]))[:, :3]
+    folder.mkdir()
+    (folder / "mechanism.yaml").write_text(yaml_text(document), encoding="utf-8")
+    table("joints", "leg1,leg2,leg3,leg4", readings, folder)
+    table("poses", "x,y,z,rx,ry,rz", np.concatenate([measured[:, :3, 3], turns], axis=1), folder)
+    (folder / "session.yaml").write_text(
+        "pkmcal: 1\nmechanism: mechanism.yaml\njoints: {file: joints.csv, noise: 0.2 mm}\n"
+        "stations:\n  laser:\n    tracker: {poses: poses.csv, noise: {position: 0.05 mm,"
+        " rotation: 1.0e-4}}\n",
+        encoding="utf-8",
+    )
+    return poses, readings, (*true, offsets)
+
+
+def table(name, header, values, folder):
+    rows = [f"c{k:02d}," + ",".join(f"{x:.9g}" for x in row) for k, row in enumerate(values)]
+    text = "\n".join([f"configuration,{header}", *rows, ""])
+    (folder / f"{name}.csv").write_text(text, encoding="utf-8")
+
+
+def lengths_at(poses, anchors, joints):
+    ends = (poses[:, None, :3, :3] @ joints[:, :, None])[..., 0] + poses[:, None, :3, 3]
+    return np.linalg.norm(ends - anchors, axis=-1)
+
+
+def test_four_cables_are_calibrated_where_a_tracker_measured_every_pose(tmp_path):
+    """The cables hold no pose, so what is stated are their lengths at poses; against the truth."""
+    ratios = []
+    for seed in range(3):
+        poses, _, (anchors, joints, offsets) = four_cables(tmp_path / str(seed), seed)
+        result = calibrate_session(tmp_path / str(seed))
+        assert result.verdict.usable
+        assert "machine.not_held" in result.verdict.codes
+        assert np.isnan(result.tool_error(poses).position).all()
+        true = lengths_at(poses, anchors, joints) - offsets
+        # the frames of base and platform are conventions
+        best = least_squares(lambda x: off_by(result.machine, poses, true, x), np.zeros(12))
+        ratios.append(np.sqrt(np.mean(best.fun**2)) / platform_sigma(result.estimate))
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def off_by(machine, poses, true, frames):
+    base, platform = perturb(np.eye(4), frames[:6]), perturb(np.eye(4), frames[6:])
+    return (machine.inverse(base @ poses @ platform) - true).ravel()
+
+
+def test_one_untracked_pose_of_four_cables_is_refused(tmp_path):
+    four_cables(tmp_path / "s", 0)
+    path = tmp_path / "s" / "poses.csv"
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n", encoding="utf-8")
+    with pytest.raises(InputError, match="4 equations for 6 freedoms"):
+        pkmcal.load_session(tmp_path / "s")
+
+
+def test_what_needs_poses_of_readings_refuses_four_cables(tmp_path):
+    _, readings, _ = four_cables(tmp_path / "s", 0)
+    machine = pkmcal.load_session(tmp_path / "s").machine
+    for asked in (machine.limits, machine.follower, lambda: machine.forward(readings)):
+        with pytest.raises(GeometryError):
+            asked()
+    with pytest.raises(InputError):
+        load_mechanism(tmp_path / "s" / "mechanism.yaml")

@@ -453,7 +453,8 @@ BARS = """\
             "m.yaml, line 3, legs: the legs do not hold the platform: 3 equations for 6 freedoms; "
             "expected one equation a leg with a length, one a revolute joint, one a pair of "
             "universal joints with axes; 6 for motion: spatial. Add legs or axes, or correct "
-            "motion.",
+            "motion. Only a session in which a tracker measured every pose of the platform does "
+            "without.",
         ),
     ],
 )

@@ -108,7 +108,8 @@ FAULTS = {
         "m.yaml, line 3, legs: the legs do not hold the platform: 5 equations for 6 freedoms; leg "
         "1, passive, holds nothing; expected one equation a leg with a length, one a revolute "
         "joint, one a pair of universal joints with axes; 6 for motion: spatial. Add legs or axes, "
-        "or correct motion.",
+        "or correct motion. Only a session in which a tracker measured every pose of the platform "
+        "does without.",
     ),
     "two of them": (
         "gough-stewart",
@@ -116,14 +117,16 @@ FAULTS = {
         "m.yaml, line 3, legs: the legs do not hold the platform: 4 equations for 6 freedoms; legs "
         "1 and 2, passive, hold nothing; expected one equation a leg with a length, one a revolute "
         "joint, one a pair of universal joints with axes; 6 for motion: spatial. Add legs or axes, "
-        "or correct motion.",
+        "or correct motion. Only a session in which a tracker measured every pose of the platform "
+        "does without.",
     ),
     "a universal axis left out": (
         "3-upu",
         [("0.0000], axis: [-1, 0, 0]", "0.0000]")],
         "m.yaml, line 3, legs: the legs do not hold the platform: 5 equations for 6 freedoms; "
         "expected one equation a leg with a length, one a revolute joint, one a pair of universal "
-        "joints with axes; 6 for motion: spatial. Add legs or axes, or correct motion.",
+        "joints with axes; 6 for motion: spatial. Add legs or axes, or correct motion. Only a session in which a tracker measured every pose of the platform "
+        "does without.",
     ),
     "half an axis held": (
         "3-upu",

@@ -417,7 +417,7 @@ def model_errors(
     unit : of the readings.
     surface : map of the bed, if it is one of the components.
     """
-    with_, without = (float(np.sqrt(np.nanmean(x.position**2))) for x in (tool, before))
+    with_, without = tool.sigma, before.sigma
     return tuple(
         ModelError(
             one.code,

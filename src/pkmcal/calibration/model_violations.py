@@ -246,9 +246,7 @@ def tool_of(session: Session, estimate: Estimate) -> ToolAccuracy:
 def _detection(
     one: Column, score: Score, fit: OneStepUpdate, tool: ToolAccuracy, rivals: Sequence[Column]
 ) -> DetectedViolation:
-    shifted = np.linalg.norm((tool.by_parameters @ fit.by_data)[:, 3:], axis=-1)
-    shift = float(np.sqrt(np.nanmean(shifted**2)))
-    sigma = float(np.sqrt(np.nanmean(tool.position**2)))
+    shift, sigma = tool.shift(fit.by_data), tool.sigma
     ratio = shift / sigma if sigma > 0 else np.inf  # no free parameter moves the tool
     level = Level.WRONG if ratio > MOST_TOOL_SHIFT and not one.remark else Level.DOUBTFUL
     # undetermined numbers are not reported

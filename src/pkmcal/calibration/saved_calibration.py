@@ -392,7 +392,7 @@ def load(source: Path | str) -> SavedCalibration:
     mechanism = saved.mechanism
     if not any(p.name.endswith(".scale") for p in saved.parameters):
         mechanism = with_exact_scales(mechanism)  # written before scales were parameters
-    machine = checked_machine(mechanism, document, "mechanism")
+    machine = checked_machine(mechanism, document, "mechanism", held=False)
     _check_parameters(document, saved, machine)
     for group, key in (
         ("stations", "T_base_camera"),

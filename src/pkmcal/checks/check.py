@@ -187,7 +187,8 @@ def _decode_images(session: Session) -> tuple[list[StationImages | None], list[F
 class _NominalKinematics:
     """Kinematics of the nominal machine at the readings.
 
-    poses : T_base_platform (K, 4, 4), None if the closure fails at some readings.
+    poses : T_base_platform (K, 4, 4), None if the closure fails at some readings, or if the legs do
+        not hold the platform.
     singularity : least over the configurations.
     assemblies : number of assembly modes at the first readings.
     """
@@ -202,6 +203,8 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematic
     """Whether the nominal machine closes at all readings, with its singularity and assembly modes
     there.
     """
+    if session.machine.layout.underdetermined:
+        return _NominalKinematics(None, math.nan, 0, (note("machine.not_held"),))
     try:
         poses, fk = platform_poses(session, most=not legs_stations(session)), session.forward
         first = session.joints[0]

@@ -1,6 +1,8 @@
 """Errors of the platform's pose by errors of the parameters, before and after calibration.
 
 The platform's pose is the purpose of a calibration; joint centres and lengths are a means to it.
+Legs that do not hold the platform (four cables under a spatial one) determine no pose by their
+readings. The purpose is then their lengths at given poses, which a controller commands.
 """
 
 from __future__ import annotations
@@ -49,12 +51,15 @@ def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
     """Derivatives (n, 6, P) of the pose (omega, tau) by the parameters at given readings.
 
     By the implicit function closure(theta, X) = 0 at given readings: dX = -(dc/dX)^+ dc/dtheta,
-    where X is the pose and, for platforms with hinges, their angles.
+    where X is the pose and, for platforms with hinges, their angles. NaN if the legs do not hold
+    the platform.
 
     joints : (n, m) readings.
     poses : (n, 4, 4) T_base_platform.
     """
     layout = machine.layout
+    if layout.underdetermined:
+        return np.full((len(poses), 6, len(machine.values)), np.nan)
     internal = machine.forward_result(joints, poses).internal if layout.n_internal else None
     c = closure(layout, machine.values, joints, poses, internal)
     by_theta = dense(c, len(machine.values))
@@ -63,7 +68,7 @@ def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
 
 def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
     """Displacements (r, P) of the platform's joints by the parameters at given readings, frames
-    removed.
+    removed; of legs that do not hold the platform, the errors of their lengths at given poses.
 
     Rows are coordinates of the joints at the session's poses (K, 4, 4) and at samples around them,
     divided by the root of the number of joints and poses: for a change v of the parameters,
@@ -71,8 +76,12 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
     treated as fixed to the centre bar, which carries the tool.
     """
     joints, poses = _around(machine, T_base_platform)
-    points = limb_ends(machine.layout, machine.values, joints, poses).b_by_pose
-    shifted = points @ pose_by_parameters(machine, joints, poses)[:, None]
+    if machine.layout.underdetermined:
+        c = closure(machine.layout, machine.values, joints, poses)
+        points, shifted = c.rows.by_pose[:, :, None], dense(c, len(machine.values))[:, :, None]
+    else:
+        points = limb_ends(machine.layout, machine.values, joints, poses).b_by_pose
+        shifted = points @ pose_by_parameters(machine, joints, poses)[:, None]
     # all frame changes, whether the parameters can follow or not, since frames are conventions
     frames = points @ (pose_generators(poses) @ respecting_motion(machine.layout.motion))[:, None]
     shifted = shifted.reshape(-1, shifted.shape[-1])
@@ -122,12 +131,15 @@ class ToolAccuracy:
     parameters : (P, P) covariance of the parameters in the same gauge.
     off : (n, 6) difference from the calibrated pose to the nominal one at the same readings, frames
         aligned.
+    by_lengths : (r, P) of legs that do not hold the platform, :func:`platform_by_parameters`; all
+        of the above is NaN then.
     """
 
     T_base_platform: Array
     by_parameters: Array
     parameters: Array
     off: Array
+    by_lengths: Array | None = None
 
     __repr__ = short_repr
 
@@ -158,6 +170,24 @@ class ToolAccuracy:
         rad.
         """
         return np.sqrt(np.maximum(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2), 0.0))
+
+    @property
+    def sigma(self) -> float:
+        """Root mean square of :attr:`position`, or of the legs' lengths where they do not hold the
+        platform, m.
+        """
+        if self.by_lengths is not None:
+            return float(np.sqrt(np.sum((self.by_lengths @ self.parameters) * self.by_lengths)))
+        return float(np.sqrt(np.nanmean(self.position**2)))
+
+    def shift(self, change: Array) -> float:
+        """Root mean square displacement, m, of that for which :attr:`sigma` is, by a change (P,) of
+        the parameters.
+        """
+        if self.by_lengths is not None:
+            return float(np.linalg.norm(self.by_lengths @ change))
+        shifted = np.linalg.norm((self.by_parameters @ change)[:, 3:], axis=-1)
+        return float(np.sqrt(np.nanmean(shifted**2)))
 
     @property
     def off_position(self) -> Array:
@@ -230,6 +260,10 @@ def tool_error(
         reached: Booleans = closed.converged & np.isfinite(joints).all(axis=-1)
     else:
         reached = np.ones(n, dtype=bool)
+    if layout.underdetermined:
+        none = np.full((n, 6, theta.size + 1), np.nan)
+        by_lengths = platform_by_parameters(calibrated, poses)
+        return ToolAccuracy(poses, none[..., 1:], covariance, none[..., 0], by_lengths)
     # derivatives, and differences to the nominal model, at the poses that can be taken
     rows = np.flatnonzero(reached)
     jacobian = np.full((n, 6, theta.size), np.nan)

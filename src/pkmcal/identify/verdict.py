@@ -173,6 +173,9 @@ def _headline(estimate: Estimate, joints: Array | None) -> str:
     machine = estimate.machine
     nominal = machine.with_values(machine.parameters.nominal)
     tool = centres_and_tool(nominal, estimate, joints)[1]
+    if machine.layout.underdetermined:
+        before = tool.shift(nominal.values - machine.values)
+        return f"Legs' lengths at given poses {amount(before, 'm')} → {amount(tool.sigma, 'm')}."
     changes: list[str] = []
     for unit, off, sigma in (
         ("m", tool.off_position, tool.position),
@@ -344,9 +347,12 @@ def misfit(
 
 def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
     """Refusal if most poses are near-singular: small errors then move the platform far, and
-    linearization does not hold.
+    linearization does not hold. A note on legs that hold the platform in no pose.
     """
     machine = estimate.machine
+    if machine.layout.underdetermined:
+        yield note("machine.not_held")
+        return
     poses = estimate.state.T_base_platform[estimate.configurations]
     weak = on_manifold(machine.layout, machine.values, poses).singularity < NEAR_SINGULAR
     if weak.mean() >= options.singular_share:

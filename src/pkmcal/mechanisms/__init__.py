@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from pkmcal.files import (
     yaml_text,
 )
 from pkmcal.mechanisms.document import MechanismDocument
+from pkmcal.mechanisms.document_checks import check_held
 from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.wording import listed
@@ -53,7 +55,7 @@ def catalogue() -> dict[str, Path]:
 
 
 def load_mechanism(
-    source: Path | str, label: str | None = None, model: str | None = None
+    source: Path | str, label: str | None = None, model: str | None = None, *, held: bool = True
 ) -> Machine:
     """Read a mechanism file, or a built-in machine by its name.
 
@@ -65,6 +67,8 @@ def load_mechanism(
         The file's name in messages.
     model :
         One of the models that the file names; its ``fixed`` and ``tied`` replace the file's own.
+    held :
+        Whether the legs have to hold the platform, as for all that follows from readings.
 
     Raises
     ------
@@ -97,9 +101,10 @@ def load_mechanism(
         chosen = checked.models[model]
         if chosen.mechanism is not None:
             beside = path.parent / chosen.mechanism
-            return load_mechanism(chosen.mechanism if chosen.mechanism in built_in else beside)
+            other = chosen.mechanism if chosen.mechanism in built_in else beside
+            return load_mechanism(other, held=held)
         checked = checked.model_copy(update={"fixed": chosen.fixed, "tied": chosen.tied})
-    return replace(checked_machine(checked, document), model=model)
+    return replace(checked_machine(checked, document, held=held), model=model)
 
 
 def _read(path: Path, label: str | None) -> tuple[Document, MechanismDocument]:
@@ -112,14 +117,23 @@ _built_in = cache(_read)
 """:func:`_read` for built-in machines, cached because the package's own files do not change."""
 
 
-def checked_machine(checked: MechanismDocument, document: Document, *keys: str) -> Machine:
+def checked_machine(
+    checked: MechanismDocument, document: Document, *keys: str, held: bool = True
+) -> Machine:
     """Machine from a validated document whose fields are under `keys` in its file.
 
+    held : whether its legs have to hold the platform.
     Raises InputError with file and field if the nominal model is not a machine, or is likely in
     millimetres.
     """
+
+    def place(*inner: Any) -> str:
+        return document.where(*keys, *inner)
+
     try:
-        machine = machine_from_document(checked, lambda *inner: document.where(*keys, *inner))
+        machine = machine_from_document(checked, place)
+        if held:
+            check_held(checked, place)
         machine.check_home()
     except InputError as error:
         if (error.where or "").startswith(document.label):

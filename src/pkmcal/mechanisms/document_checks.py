@@ -73,7 +73,6 @@ def check_nominal(document: MechanismDocument, where: PlaceInDocument | None = N
     for side, legs, fields in sharing(document):
         for field in fields:
             _check_equal(document, side, legs, field, place)
-    _check_equations(document, place)
 
 
 def _check_screw(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDocument) -> None:
@@ -268,8 +267,8 @@ def _check_equal(
             )
 
 
-def _check_equations(document: MechanismDocument, place: PlaceInDocument) -> None:
-    """Check that there are at least as many closure equations as freedoms of the platform and its
+def check_held(document: MechanismDocument, place: PlaceInDocument) -> None:
+    """Raise InputError if there are fewer closure equations than freedoms of the platform and its
     hinges.
     """
     passive = [
@@ -291,5 +290,6 @@ def _check_equations(document: MechanismDocument, place: PlaceInDocument) -> Non
         expected="one equation a leg with a length, one a revolute joint, one a pair of universal "
         f"joints with axes; {freedoms} for motion: {document.motion}"
         f"{f' and its {listed(kinds)}' if kinds else ''}",
-        next_step="Add legs or axes, or correct motion",
+        next_step="Add legs or axes, or correct motion. Only a session in which a tracker measured"
+        " every pose of the platform does without",
     )

@@ -466,7 +466,7 @@ def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
     """Smallest singular value (...) of :func:`scaled_rows`, whose rows are about unit vectors: 0 if
     the platform can move with all joints locked; NaN if the rows are not finite.
     """
-    if layout.n_equations < scaled.shape[-1]:  # fewer rows than freedoms
+    if layout.underdetermined:
         return np.zeros(scaled.shape[:-2])
     finite = np.isfinite(scaled).all(axis=(-1, -2))
     least = np.linalg.svd(np.nan_to_num(scaled), compute_uv=False)[..., -1]

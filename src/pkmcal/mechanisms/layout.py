@@ -210,6 +210,13 @@ class LimbLayout:
         return self.n_equations > self.own_motion.shape[1]
 
     @cached_property
+    def underdetermined(self) -> bool:
+        """Whether there are fewer rows than unknowns: the legs alone do not hold the platform, so
+        that its pose does not follow from the readings. Four cables need gravity besides.
+        """
+        return self.n_equations < self.own_motion.shape[1]
+
+    @cached_property
     def unsure_scales(self) -> Booleans:
         """Whether the scale of each leg's reading (L,) is a parameter."""
         return self.scale < self.n_parameters

@@ -279,8 +279,10 @@ class Machine:
         """Forward kinematics: platform poses T_base_platform (n, 4, 4) at readings (n, m).
 
         start : (4, 4) or (n, 4, 4), near the wanted assembly mode; by default the home pose.
-        Raises GeometryError if the machine cannot be closed at the readings.
+        Raises GeometryError if the machine cannot be closed at the readings, or if the legs do not
+        hold the platform.
         """
+        self._check_held()
         fk = self.forward_result(joints, start)
         if not fk.converged.all():
             bad = np.flatnonzero(~np.atleast_1d(fk.converged))
@@ -306,7 +308,9 @@ class Machine:
         which starts from its last result; see :class:`~pkmcal.mechanisms.follower.Follower`.
 
         start : (4, 4), present pose of the machine; by default the home pose.
+        Raises GeometryError if the legs do not hold the platform.
         """
+        self._check_held()
         from pkmcal.mechanisms.follower import Follower
 
         begin = self._home if start is None else _finite_array(start, (4, 4), "start")
@@ -338,12 +342,23 @@ class Machine:
         point = None if p_platform is None else _finite_array(p_platform, (3,), "p_platform")
         return velocities.amplification(self.layout, self.values, poses, point)
 
+    def _check_held(self) -> None:
+        """Raise GeometryError if the legs do not hold the platform."""
+        if self.layout.underdetermined:
+            raise GeometryError(
+                what=f"the legs of {self.name!r} alone do not hold the platform: no pose follows"
+                " from their readings",
+                found=f"{self.layout.n_equations} equations for"
+                f" {self.layout.own_motion.shape[1]} freedoms",
+            )
+
     def limits(self) -> workspace.Limits:
         """Machine with its ranges and home assembly, for the functions of workspaces.
 
         Home is projected onto poses that rods and axes allow, because with calibrated parameters
-        the file's home is not exact.
+        the file's home is not exact. Raises GeometryError if the legs do not hold the platform.
         """
+        self._check_held()
         home = kinematics.on_manifold(self.layout, self.values, self._home)
         return workspace.Limits(
             self.layout,

@@ -384,7 +384,7 @@ def _mean(values: Array) -> float | None:
 
 def _tool_sigma(session: Session, estimate: Estimate, tool: ToolAccuracy) -> Figure | None:
     """Card on the standard deviation of the platform's pose that follows from the geometry's."""
-    if not tool.position.size:
+    if not np.isfinite(tool.position).any():
         return None
     used = np.flatnonzero(estimate.configurations)
     where = session.configurations[used[int(np.argmax(tool.position))]]

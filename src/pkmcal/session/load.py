@@ -47,6 +47,7 @@ from pkmcal.geometry.rigid import look_at
 from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import LinkKind, kinds_of, measurement_kinds
 from pkmcal.measurements.heights import Heights
+from pkmcal.measurements.tracker_poses import TrackerPoses
 from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanism
 from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.mechanisms.region import Region
@@ -271,7 +272,8 @@ class Session:
 
     def other_model(self, name: str | None) -> Machine:
         """Machine with another model from the same mechanism file."""
-        return load_mechanism(self.mechanism, model=name)
+        held = not self.machine.layout.underdetermined
+        return load_mechanism(self.mechanism, model=name, held=held)
 
 
 def session_folder(subject: str) -> Path | None:
@@ -314,7 +316,7 @@ def load_session(
     # Session file and machine.
     folder, document = _session_document(Path(folder))
     schema = validated_document(document, session_schema())
-    machine, source = _machine(folder, document, schema.mechanism, model)
+    machine, source = _machine(folder, document, schema.mechanism, model, held=False)
     # Joint readings.
     table, temperature, findings = _readings(folder, document, schema, machine, measured, fewest)
     # Board, camera stations and trackers.
@@ -330,6 +332,8 @@ def load_session(
     links = _links(folder, document, schema, table.names, machine) if measured else ()
     findings += _default_noise(trackers, links)
     # Checks across files.
+    if machine.layout.underdetermined and (stations or not _all_tracked(table, trackers)):
+        _machine(folder, document, schema.mechanism, model, held=True)
     if measured:
         _check_paths(document, schema, table)
     _check_distinct(document, stations)
@@ -428,6 +432,12 @@ def _trackers(
     return tuple(out)
 
 
+def _all_tracked(table: CsvTable, trackers: tuple[PoseTable, ...]) -> bool:
+    """Whether trackers measured the platform's whole pose in every configuration."""
+    whole = [one.configuration for one in trackers if one.kind == TrackerPoses.code]
+    return bool(whole) and set(np.concatenate(whole).tolist()) == set(range(len(table.names)))
+
+
 def _session_document(folder: Path) -> tuple[Path, Document]:
     """Folder and session.yaml of a session, its format version checked before its content."""
     if folder.name == SESSION_FILE_NAME and folder.is_file():
@@ -486,16 +496,19 @@ def _regular_file(folder: Path, document: Document, name: str, keys: Keys) -> Pa
 
 
 def _machine(
-    folder: Path, document: Document, source: str, model: str | None
+    folder: Path, document: Document, source: str, model: str | None, *, held: bool
 ) -> tuple[Machine, Path | str]:
     """Machine, and the source from which its other models are loaded: a file's path or a built-in
     name.
+
+    held : whether legs that do not hold the platform are an error.
     """
     looks_like_path = source.endswith((".yaml", ".yml")) or "/" in source
     if looks_like_path or len(source) > LONGEST_NAME or (folder / source).is_file():
         path = _regular_file(folder, document, source, ("mechanism",))
-        return load_mechanism(path, label=source, model=model), path
-    return load_mechanism(source, label=document.where("mechanism"), model=model), source
+        return load_mechanism(path, label=source, model=model, held=held), path
+    where = document.where("mechanism")
+    return load_mechanism(source, label=where, model=model, held=held), source
 
 
 def _check_redundant(document: Document, machine: Machine) -> None:
