@@ -328,12 +328,12 @@ def test_four_cables_are_calibrated_where_a_tracker_measured_every_pose(tmp_path
         assert np.isnan(result.tool_error(poses).position).all()
         true = lengths_at(poses, anchors, joints) - offsets
         # the frames of base and platform are conventions
-        best = least_squares(lambda x: off_by(result.machine, poses, true, x), np.zeros(12))
+        best = least_squares(off_by, np.zeros(12), args=(result.machine, poses, true))
         ratios.append(np.sqrt(np.mean(best.fun**2)) / platform_sigma(result.estimate))
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
-def off_by(machine, poses, true, frames):
+def off_by(frames, machine, poses, true):
     base, platform = perturb(np.eye(4), frames[:6]), perturb(np.eye(4), frames[6:])
     return (machine.inverse(base @ poses @ platform) - true).ravel()
 

@@ -125,7 +125,8 @@ FAULTS = {
         [("0.0000], axis: [-1, 0, 0]", "0.0000]")],
         "m.yaml, line 3, legs: the legs do not hold the platform: 5 equations for 6 freedoms; "
         "expected one equation a leg with a length, one a revolute joint, one a pair of universal "
-        "joints with axes; 6 for motion: spatial. Add legs or axes, or correct motion. Only a session in which a tracker measured every pose of the platform "
+        "joints with axes; 6 for motion: spatial. Add legs or axes, or correct motion. Only a "
+        "session in which a tracker measured every pose of the platform "
         "does without.",
     ),
     "half an axis held": (
