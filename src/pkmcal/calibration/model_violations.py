@@ -25,9 +25,9 @@ from pkmcal.calibration.discrepancy_basis import (
     model_errors,
     with_discrepancy,
 )
-from pkmcal.calibration.tube_outlines import outlines
+from pkmcal.calibration.tube_outlines import Outline, outlines
 from pkmcal.identify.centres import free_of_gauge
-from pkmcal.identify.discrepancy import discrepancy_of
+from pkmcal.identify.discrepancy import Discrepancy, discrepancy_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import (
     MOST_VIOLATIONS_SOUGHT,
@@ -137,65 +137,10 @@ def model_violations(
 
     tested : families of violations, :data:`TESTED` by default.
     """
-    # columns of all violations, by family; tubes have a score of their own
-    ended = estimate.linearized
-    columns, units = session.document["joints"]["columns"], session.machine.joint_units
-    families = [
-        list(family(session, observation, measurements, estimate))
-        for family in (TESTED if tested is None else tested)
-    ]
-    tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
-    further = [one for one in columns_of_effects(measurements) if one.prior is None]
-    families += [list(group) for _, group in groupby(further, key=lambda one: one.code)]
-    families.append([one.column for one in tubes])
-    listed = [one for family in families for one in family]
-    first_tube = len(listed) - len(tubes)
-    number = np.repeat(np.arange(len(families)), [len(family) for family in families])
-    tube_scores = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
-    in_view = np.flatnonzero(estimate.configurations)
-
-    # column of violation k: a listed one, or a single reading
-    def declared(k: int) -> Column:
-        if k < len(listed):
-            return listed[k]
-        row, m = divmod(k - len(listed), len(columns))
-        by = np.zeros((*measurements.joints.shape, 1))
-        by[in_view[row], m] = 1.0
-        configuration = session.configurations[in_view[row]]
-        return readings.wrong_reading(columns[m], units[m], configuration, by)
-
-    def scored(beside: Sequence[Column]) -> tuple[ScoreTests, list[tuple[int, Score]]]:
-        tests = ScoreTests(
-            *ended,
-            listed,
-            number.tolist(),
-            singles=True,
-            beside=beside,
-            variance=1 + measurements.imputation_covariance,
-        )
-        value = tests.significant([k for k, _ in tube_scores])
-        return tests, [*value, *tube_scores]
-
-    # violations, the discrepancy beside them, then the violations beside the discrepancy
-    components = discrepancy_components(measurements, estimate)
-    tests, value = scored(())
-    rivals = detected = [k for k, _ in value]
-    while True:
-        discrepancy = discrepancy_of(
-            *ended,
-            components,
-            [declared(k) for k in rivals],
-            (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
-            only_heights(estimate),
-        )
-        if not detected or (rivals is detected and not discrepancy.scales):
-            break
-        # a rival that is no violation beside the discrepancy must have no part in it
-        tests, value = scored(discrepancy.random)
-        named = {k for k, _ in value}
-        if named.issuperset(rivals):
-            break
-        rivals = [k for k in rivals if k in named]
+    candidates = _Candidates.of(
+        session, observation, measurements, estimate, TESTED if tested is None else tested
+    )
+    tests, scores, discrepancy = candidates.beside_discrepancy()
     # covariance with the discrepancy, and its effect on the tool
     before = tool_of(session, estimate)
     estimate = with_discrepancy(estimate, discrepancy)
@@ -203,31 +148,123 @@ def model_violations(
     surface = None
     if any(one.code == UNEVEN_BED for one in discrepancy.scales):
         surface = bed_surface(measurements, estimate, discrepancy)
-    errors = model_errors(discrepancy, tool, before, units[0], surface)
-    if not value:
-        return ModelViolations((), errors, estimate, discrepancy.random)
-    # one-step estimates of the named violations
-    fits = tests.fitted([k for k, _ in value])
-    # the value of a tube is the median of its lines'
-    for k, one in enumerate(tubes, len(fits) - len(tubes)):
-        share = one.value / fits[k].value[0] if fits[k].value[0] else 0.0
-        fits[k] = OneStepUpdate(
-            np.array([one.value]), np.array([one.sigma]), fits[k].by_data * share
-        )
-    violations = tuple(
-        _detection(
-            declared(k),
-            score,
-            fit,
-            tool,
-            # a tube's value is that of its own lines
-            []
-            if k in dict(tube_scores)
-            else [listed[n] for n in tests.rivals(k, [n for n, _ in value if n != k])],
-        )
-        for (k, score), fit in zip(value, fits, strict=True)
+    unit = session.machine.joint_units[0]
+    return ModelViolations(
+        candidates.detections(tests, scores, tool),
+        model_errors(discrepancy, tool, before, unit, surface),
+        estimate,
+        discrepancy.random,
     )
-    return ModelViolations(violations, errors, estimate, discrepancy.random)
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """Columns of the violations that are tested.
+
+    listed : columns by family, those of tubes last. After them count the single readings, which
+        need no list.
+    families : family of each listed column.
+    tubes : outlines of tubes, which have scores of their own.
+    """
+
+    session: Session
+    measurements: Measurements
+    estimate: Estimate
+    listed: list[Column]
+    families: list[int]
+    tubes: list[Outline]
+
+    @classmethod
+    def of(
+        cls,
+        session: Session,
+        observation: Observation,
+        measurements: Measurements,
+        estimate: Estimate,
+        tested: Sequence[Family],
+    ) -> _Candidates:
+        """Columns of the families, of effects without a prior, and of tubes."""
+        families = [list(family(session, observation, measurements, estimate)) for family in tested]
+        further = [one for one in columns_of_effects(measurements) if one.prior is None]
+        families += [list(group) for _, group in groupby(further, key=lambda one: one.code)]
+        tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
+        families.append([one.column for one in tubes])
+        listed = [(one, n) for n, family in enumerate(families) for one in family]
+        columns, numbers = [one for one, _ in listed], [n for _, n in listed]
+        return cls(session, measurements, estimate, columns, numbers, tubes)
+
+    def column(self, k: int) -> Column:
+        """Column of violation k: a listed one, or a single reading."""
+        if k < len(self.listed):
+            return self.listed[k]
+        names = self.session.document["joints"]["columns"]
+        row, m = divmod(k - len(self.listed), len(names))
+        configuration = np.flatnonzero(self.estimate.configurations)[row]
+        by = np.zeros((*self.measurements.joints.shape, 1))
+        by[configuration, m] = 1.0
+        unit, name = self.session.machine.joint_units[m], self.session.configurations[configuration]
+        return readings.wrong_reading(names[m], unit, name, by)
+
+    @property
+    def tube_scores(self) -> dict[int, Score]:
+        """Scores of the tubes, by the violation's number."""
+        first = len(self.listed) - len(self.tubes)
+        return {first + k: one.score for k, one in enumerate(self.tubes)}
+
+    def scored(self, beside: Sequence[Column]) -> tuple[ScoreTests, dict[int, Score]]:
+        """Score tests beside other columns, and the significant violations by number."""
+        tests = ScoreTests(
+            *self.estimate.linearized,
+            self.listed,
+            self.families,
+            singles=True,
+            beside=beside,
+            variance=1 + self.measurements.imputation_covariance,
+        )
+        return tests, dict(tests.significant([*self.tube_scores])) | self.tube_scores
+
+    def beside_discrepancy(self) -> tuple[ScoreTests, dict[int, Score], Discrepancy]:
+        """Tests and scores of the violations beside the discrepancy, and the latter beside them."""
+        components = discrepancy_components(self.measurements, self.estimate)
+        statistics = self.estimate.statistics
+        alone = self.scored(())
+        rivals = [*alone[1]]
+        while True:
+            discrepancy = discrepancy_of(
+                *self.estimate.linearized,
+                components,
+                [self.column(k) for k in rivals],
+                (statistics.reading_scale, statistics.pose_scale),
+                only_heights(self.estimate),
+            )
+            beside = discrepancy.scales and alone[1]
+            tests, scores = self.scored(discrepancy.random) if beside else alone
+            # a rival that is no violation beside the discrepancy must have no part in it
+            if scores.keys() >= set(rivals):
+                return tests, scores, discrepancy
+            rivals = [k for k in rivals if k in scores]
+
+    def detections(
+        self, tests: ScoreTests, scores: Mapping[int, Score], tool: ToolAccuracy
+    ) -> tuple[DetectedViolation, ...]:
+        """Violations with one-step estimates of their numbers, all together."""
+        if not scores:
+            return ()
+        fits = dict(zip(scores, tests.fitted([*scores]), strict=True))
+        # the value of a tube is the median of its lines'
+        for k, one in zip(self.tube_scores, self.tubes, strict=True):
+            share = one.value / fits[k].value[0] if fits[k].value[0] else 0.0
+            value, sigma = np.array([one.value]), np.array([one.sigma])
+            fits[k] = OneStepUpdate(value, sigma, fits[k].by_data * share)
+        # a tube's value is that of its own lines, so it has no rivals
+        rivals = {
+            k: () if k in self.tube_scores else tests.rivals(k, [n for n in scores if n != k])
+            for k in scores
+        }
+        return tuple(
+            _detection(self.column(k), scores[k], fits[k], tool, [self.listed[n] for n in found])
+            for k, found in rivals.items()
+        )
 
 
 def tool_of(session: Session, estimate: Estimate) -> ToolAccuracy:
