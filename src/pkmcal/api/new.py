@@ -217,36 +217,10 @@ def new(
     dimensions = {name: value for name, value in given.items() if value is not None}
     for name, value in dimensions.items():
         check_number("new", name, value)
-    if printer is None and firmware is not None:
-        raise InputError(
-            "a firmware is named for a printer's file",
-            where="--firmware",
-            expected="--printer FILE besides",
-        )
-    if printer is None and probed is None and part is None:
-        what = "both" if board and legs else "board" if board else "legs" if legs else None
-        nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
-        if isinstance(nominal, dict):
-            others = {"--legs": legs, "--board": board, "--places": places}
-            if extra := [name for name, given in others.items() if given]:
-                raise InputError(
-                    "the file has all measurements of its session",
-                    where="--from",
-                    found=f"{listed(extra)} besides",
-                    expected="--from FILE alone",
-                )
-            return NewResult(nominal, complete=True)
-        return NewResult(
-            session_texts(nominal, what, places or 1),
-            assumed=nominal.assumed if isinstance(nominal, NominalModel) else (),
-        )
     if printer is None:
-        raise InputError(
-            "a printer's measurements need its configuration",
-            where="--part" if probed is None else "--probed",
-            expected="--printer FILE besides: its printer.cfg, its config.g with M665, or what M503"
-            " printed",
-        )
+        _check_no_printer(firmware, probed, part)
+        nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
+        return _of_nominal(nominal, board, legs, places)
     others = {"--machine": machine, "--legs": legs}
     others |= {"--probed": probed, "--part": part} if board else {}
     others |= {"--from": from_file, "--unit": unit}
@@ -267,6 +241,49 @@ def new(
         None if part is None else Path(part),
     )
     return NewResult(texts, of_printer=True, complete=not board, remarks=remarks)
+
+
+def _check_no_printer(
+    firmware: str | None, probed: Path | str | None, part: Path | str | None
+) -> None:
+    """Raise InputError for what only a printer's session has."""
+    if firmware is not None:
+        raise InputError(
+            "a firmware is named for a printer's file",
+            where="--firmware",
+            expected="--printer FILE besides",
+        )
+    if probed is not None or part is not None:
+        raise InputError(
+            "a printer's measurements need its configuration",
+            where="--part" if probed is None else "--probed",
+            expected="--printer FILE besides: its printer.cfg, its config.g with M665, or what M503"
+            " printed",
+        )
+
+
+def _of_nominal(
+    nominal: NominalModel | SessionTexts | str | None,
+    board: bool,
+    legs: bool,
+    places: int | None,
+) -> NewResult:
+    """Session of a nominal model, to be filled in, or the whole one that its file has."""
+    if isinstance(nominal, dict):
+        others = {"--legs": legs, "--board": board, "--places": places}
+        if extra := [name for name, given in others.items() if given]:
+            raise InputError(
+                "the file has all measurements of its session",
+                where="--from",
+                found=f"{listed(extra)} besides",
+                expected="--from FILE alone",
+            )
+        return NewResult(nominal, complete=True)
+    observed = "both" if board and legs else "board" if board else "legs" if legs else None
+    return NewResult(
+        session_texts(nominal, observed, places or 1),
+        assumed=nominal.assumed if isinstance(nominal, NominalModel) else (),
+    )
 
 
 def _nominal(
