@@ -17,7 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board
-from pkmcal.levels import CONTRADICTION_SIGMAS
+from pkmcal.levels import CONTRADICTION_SIGMAS, MAJORITY
 from pkmcal.observe.images import narrowed
 
 LEAST_WINDOW_RADIUS = 2.5
@@ -43,9 +43,9 @@ class CircleOptions:
     ring: float = 0.85
     # least difference between circle and paper, in standard deviations of the paper
     least_contrast: float = CONTRADICTION_SIGMAS
-    # largest fourth harmonic of a circle's outline, weighted by the fourth power of the radius; a
-    # square has 0.43 (derived)
-    most_angular: float = 0.25
+    # largest fourth harmonic of a circle's outline, weighted by the fourth power of the radius:
+    # half of a square's 3/7 (derived)
+    most_angular: float = MAJORITY * 3 / 7
 
 
 CIRCLE_OPTIONS = CircleOptions()

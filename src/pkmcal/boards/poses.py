@@ -61,9 +61,8 @@ class BoardPoseOptions:
     # camera on a tripod keeps a tenth of a pixel; smaller movements hardly matter for edges of
     # legs, which are as uncertain
     still: float = 0.2
-    # standard deviations of the images' own noise allowed in addition (statistical: 6 in 10^5 by
-    # chance)
-    moved: float = 4.0
+    # standard deviations of the images' own noise allowed in addition
+    moved: float = CONTRADICTION_SIGMAS
     # largest share of single images that disagree; with more, the board never stood still
     most_outlying: float = 1 / 3
     # largest share of a pose's covariance that repeats have in common (numerical: keeps the rest

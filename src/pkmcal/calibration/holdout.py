@@ -29,9 +29,9 @@ MOST_CLUSTERING_ROUNDS = 100
 """Upper bound of the k-means iterations."""
 TIE = 1e-6
 """Difference of distances, as a share of the points' extent, that counts as none."""
-NAMED_REGION_OFFSET = 0.7
-"""Offset of a region from the middle, in standard deviations of the whole workspace, from which
-a direction is part of its name."""
+NAMED_REGION_OFFSET = 3**-0.5
+"""Offset of a region from the middle, in standard deviations of the whole workspace, from which a
+direction is part of its name: a third of half the range of evenly spread configurations."""
 REGION_DIRECTION_NAMES = (
     ("turned about −x", "turned about +x"),
     ("turned about −y", "turned about +y"),

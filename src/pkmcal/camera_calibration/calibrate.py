@@ -50,8 +50,8 @@ from pkmcal.files import closest, json_value
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.levels import (
     FALSE_ALARM,
+    INSEPARABLE_CORRELATION,
     MAJORITY,
-    NEARLY_ALL,
     NEGLIGIBLE,
     OUTLIER_SIGMAS,
     UNEXPLAINED_SCALE,
@@ -98,8 +98,6 @@ class CalibrationCheckOptions:
 CALIBRATION_CHECK_OPTIONS = CalibrationCheckOptions()
 UNCERTAINTY_CELLS = (32, 24)
 """Columns and rows of cells in which the projection's uncertainty is computed."""
-STRONG_CORRELATION = NEARLY_ALL**0.5
-"""Correlation from which two intrinsics are reported as hardly separable."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +186,7 @@ class CameraCalibration:
             (names[i], names[j], float(rho[i, j]))
             for i in range(len(names))
             for j in range(i + 1, len(names))
-            if abs(rho[i, j]) >= STRONG_CORRELATION
+            if abs(rho[i, j]) >= INSEPARABLE_CORRELATION
         ]
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
@@ -293,7 +291,7 @@ def calibrate_camera(
     # Covariance, scaled by the disagreement of the views.
     beside = rows_of(fit, views, bend_of(board)) if bend else None
     by_noise, poses_by_noise, by_intrinsics = covariance_of(fit, views, beside)
-    spread = spread_of_views(fit, views, selection)
+    spread = spread_of_views(fit, views)
     covariance = by_noise * spread**2
     check_determined(fit, covariance, views, options=options)
     # Test on held-out views.

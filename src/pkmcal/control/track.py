@@ -19,6 +19,7 @@ from pkmcal.control.machine_view import MachineView, directions_of, leg_ends_in_
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, perturb, pose_difference, skew
+from pkmcal.levels import UNEXPLAINED_SCALE
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
@@ -44,8 +45,6 @@ READINGS_LAG_SIGMA = 0.001
 """Standard deviation, in metres, between a reading and the image: 50 mm/s for 20 ms between the
 two. Edges determine some motions of the platform a hundred times worse than others; readings
 determine those."""
-ONE_LEG_MISFIT = 16.0
-"""Mean squared misfit, in variances, above which edges are not those of one leg."""
 LEG_EDGE_SIDES = np.array([0, 1])
 LOST_EDGE_DISTANCE = 0.7
 """Median distance, in px, of edges from their prediction above which all are rejected: if legs
@@ -166,7 +165,7 @@ def leg_lines(view: MachineView, rows: EdgeMisfits) -> LegLines:
     # consistency of the edges with one leg
     residual = rows.misfit - (jac @ shifted[rows.leg][..., None])[..., 0]
     square = pick @ dot(residual, (rows.information @ residual[..., None])[..., 0])
-    agrees = square < ONE_LEG_MISFIT * np.maximum(2 * pick.sum(axis=1) - 4, 1)
+    agrees = square < UNEXPLAINED_SCALE**2 * np.maximum(2 * pick.sum(axis=1) - 4, 1)
     both = np.logical_and(*(pick @ (rows.side == side) > 0 for side in LEG_EDGE_SIDES))
     a, b = (
         p + (across @ m[..., None])[..., 0]

@@ -24,6 +24,7 @@ from pkmcal.levels import (
     FEW,
     MAJORITY,
     NEGLIGIBLE,
+    RELEVANT_SHARE,
     ROUNDING,
     UNEXPLAINED_SCALE,
 )
@@ -39,7 +40,7 @@ from pkmcal.wording import amount, in_full, listed
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
 
-POLISHED_SHADING = 4 * OWN_SHADING
+POLISHED_SHADING = UNEXPLAINED_SCALE * OWN_SHADING
 """Shading of each edge in addition to its line, px, above which tubes look like polished metal, or
 are in hard light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted
 ones."""
@@ -61,8 +62,8 @@ class VerdictOptions:
     # since it hardly increases the standard deviation
     least_noise_share: float = FEW
     # displacement by one undetermined motion, relative to the platform's standard deviation, that
-    # causes a warning: one half increases the standard deviation by an eighth
-    worth_reporting: float = 0.5
+    # causes a warning
+    worth_reporting: float = RELEVANT_SHARE
     # share of configurations near a singular pose above which the estimate is not reliable
     singular_share: float = MAJORITY
     # share of the undetermined displacement above which one motion is a reason of its own
