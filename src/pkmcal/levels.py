@@ -3,6 +3,7 @@ more than noise.
 
 Probabilities of false alarms are in :mod:`pkmcal.identify.false_alarm` and, of hypotheses, in
 :mod:`pkmcal.outcome.hypotheses`. Limits of one algorithm are fields of its options.
+Half or twice a level was tried only where its docstring gives the result.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board
-from pkmcal.levels import CONTRADICTION_SIGMAS, MAJORITY
+from pkmcal.levels import CONTRADICTION_SIGMAS
 from pkmcal.observe.images import narrowed
 
 LEAST_WINDOW_RADIUS = 2.5
@@ -43,9 +43,11 @@ class CircleOptions:
     ring: float = 0.85
     # least difference between circle and paper, in standard deviations of the paper
     least_contrast: float = CONTRADICTION_SIGMAS
-    # largest fourth harmonic of a circle's outline, weighted by the fourth power of the radius:
-    # half of a square's 3/7 (derived)
-    most_angular: float = MAJORITY * 3 / 7
+    # largest fourth harmonic of a circle's outline, weighted by the fourth power of the radius; a
+    # square has 3/7 (derived). Of simulated grids with pitches of 10 and 20 px, blurs of 0.7 and
+    # 1.8 px and noise of 1 and 4 levels (32 images of either kind), it keeps 90 % of the circles
+    # and 73 % of squares; 3/14 keeps 85 and 66 %, no limit 93 % of both
+    most_angular: float = 0.25
 
 
 CIRCLE_OPTIONS = CircleOptions()

@@ -59,7 +59,8 @@ class OtherBoardOptions:
     # least relative difference between measured and described markers: corners of markers are
     # located to about half a pixel, a twentieth of the smallest markers used (derived)
     size_difference: float = 0.1
-    # fewest markers for a measurement of their size, and for another dictionary
+    # fewest markers for a measurement of their size, and for another dictionary; not checked with
+    # other numbers
     least_markers: int = 4
     # most outlines of markers that are compared with all dictionaries, the largest first
     most_outlines: int = 24

@@ -23,7 +23,8 @@ from pkmcal.session.readings import same_pose
 from pkmcal.wording import count, listed
 
 FEWEST_TO_CALIBRATE = 3
-"""Fewest configurations from which a calibration is meaningful."""
+"""Fewest configurations from which a calibration is meaningful. Whether it is, its own verdict
+decides; not checked with other numbers."""
 
 MOST_CLUSTERING_ROUNDS = 100
 """Upper bound of the k-means iterations."""

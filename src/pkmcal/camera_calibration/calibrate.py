@@ -66,23 +66,29 @@ from pkmcal.wording import listed
 class CalibrationCheckOptions:
     """Thresholds of the checks of a camera calibration."""
 
-    # fewest images that show the board
+    # fewest images that show the board: each gives two equations for the five intrinsics of a
+    # camera without distortion (Z. Zhang, 2000)
     least_views: int = 3
-    # number of images below which a warning is given
+    # number of images below which a warning is given. Of a simulated pinhole with 54 corners of 0.1
+    # px and tilts up to 30 degrees (12 seeds), the focal length has a standard deviation of 0.2 %
+    # with 3 images, 0.1 % with 6 and 0.07 % with 12
     good_views: int = 6
     # ratio of held-out errors above which a model named by the user is refused; a smaller
     # significant ratio gives a warning
     unfit_ratio: float = UNEXPLAINED_SCALE
     # largest standard deviation of the focal length, as a share of it; a machine of 1 m would be
-    # off by 2 cm
+    # off by 2 cm. In the same simulation, 3 images tilted by at most 7.5 degrees have 1.7 %, in the
+    # worst case 2.7 %; all images tilted by 15 degrees or more have less than half of the limit
     least_sure: float = 0.02
     # largest share of rejected corners. Their noise is estimated from the better half of all
-    # corners, which does not represent the rest if its errors are of another kind
+    # corners, which does not represent the rest if its errors are of another kind. Not checked
+    # within a factor of two
     most_lost: float = 0.25
     # ratio of a view's held-out error to the median of all views above which the view is reported
     outlying_view: float = OUTLIER_SIGMAS
     # tilt of a board in degrees below which views all have the same information on the focal
-    # length, which is little
+    # length, which is little: in the same simulation of 6 images, a standard deviation of 1 % up to
+    # 7.5 degrees, 0.3 % up to 15 and 0.1 % up to 30
     facing_tilt: float = 15.0
     # most steps in which a board's bend and the rest are estimated in turn; two or three suffice
     bend_steps: int = 10

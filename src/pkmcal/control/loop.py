@@ -11,6 +11,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.control.goal import (
+    GOAL_TOLERANCE,
     Goal,
     GoalImage,
     Status,
@@ -56,20 +57,18 @@ from pkmcal.wording import named
 
 __all__ = ["GoalImage", "Status", "Step", "VisualServo"]
 
-GOAL_READING_TOLERANCE = 5e-4
-"""Difference of a reading, in m or rad, from the goal's that counts as converged: one image of
-640x480 pixels determines it to 0.3 mm."""
 UNEXPLAINED_READINGS_LAG = OUTLIER_SIGMAS * READINGS_LAG_SIGMA
 """Difference, in metres, between an image and its readings that a control loop's delay does not
 explain."""
 VAGUE_DISTANCE_TOLERANCES = 4.0
 """Standard deviation of a reading's distance to the goal, in tolerances, above which there is a
-warning."""
+warning; the loop goes on. Not checked within a factor of two."""
 UNSEEN_READING_SIGMA = 0.05
-"""Standard deviation of a reading, in m or rad, above which an image does not determine it."""
+"""Standard deviation of a reading, in m or rad, above which an image does not determine it, and the
+loop stops. Not checked within a factor of two."""
 OTHER_POSITION_ANGLE = 0.02
 """RMS angle, in rad, that is more than noise: with readings at rest and edges this far from the
-goal, the law has reached another equilibrium."""
+goal, the law has reached another equilibrium. Not checked within a factor of two."""
 NO_EDGES_TEXT = (
     "likely causes: another assembly than the start's, readings of another image, a camera"
     " that was moved, too little light"
@@ -130,7 +129,7 @@ class VisualServo:
         rate_limits: float | Array | None = None,
         legs: Integers | None = None,
         start: Array | None = None,
-        tolerance: float = GOAL_READING_TOLERANCE,
+        tolerance: float = GOAL_TOLERANCE,
         period: float = 0.0,
         edge_shift: float = 0.0,
         binning: int | None = None,

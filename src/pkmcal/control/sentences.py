@@ -15,9 +15,11 @@ from pkmcal.outcome.finding import Finding, Level, doubtful, note, wrong
 from pkmcal.wording import named
 
 UNMENTIONED_HIDDEN_SHARE = 0.05
-"""Share of the poses with a leg behind another leg above which there is a finding."""
+"""Share of the poses with a leg behind another leg above which there is a warning. Not checked
+within a factor of two."""
 UNMENTIONED_OVERSHOOT = 0.05
-"""Overshoot, relative to the path's length, above which there is a finding."""
+"""Overshoot, relative to the path's length, above which there is a warning, if it is also twice
+that with the identified geometry. Not checked within a factor of two."""
 
 
 def judgement(study: Study) -> Verdict:

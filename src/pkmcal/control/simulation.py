@@ -13,6 +13,7 @@ from enum import Enum
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.control.goal import GOAL_TOLERANCE
 from pkmcal.control.image import Eye
 from pkmcal.control.laws import MatrixPlace, joint_velocities, law_named, limited, solution, task_of
 from pkmcal.control.machine_view import MachineView, directions_of, legs_from_image
@@ -29,13 +30,8 @@ IMAGES_A_GOAL = 24
 ARRIVED_DISTANCE_SHARE = 0.02
 """Distance from the goal, relative to the path's length, of a platform that has arrived: 2 %, as
 usual for settling times."""
-LEAST_DISTANCE = 5e-4
-"""Distance of the platform's joints, in metres, within which a goal is reached however short the
-path."""
 FINAL_RUN_SHARE = 0.1
 """Share of a run, at its end, whose mean decides how the run ended."""
-AT_REST = 0.02
-"""Velocity, relative to that of an exponential approach, below which a run is at rest."""
 AT_STOP = 1e-9
 """Distance, in m or rad, by which rounding may put a reading beyond its range."""
 NO_EDGE_NOISE = EdgeNoise(shift=0.0, tilt=0.0)
@@ -435,12 +431,13 @@ def _judged(error: Array, direction: Array, loop: LoopSettings, floor: Array) ->
     e, w = error[:, -n:].mean(axis=1), direction[:, -n:].mean(axis=1)
     before = direction[:, -2 * n : -n].mean(axis=1) if error.shape[1] >= 2 * n else w
     # arrived : near the goal, or as near as noise allows. shaken : noise keeps the platform away
-    near = np.maximum(ARRIVED_DISTANCE_SHARE * direction[:, 0], LEAST_DISTANCE)
+    near = np.maximum(ARRIVED_DISTANCE_SHARE * direction[:, 0], GOAL_TOLERANCE)
     # with nearly all of its path behind it
     arrived = w < np.maximum(near, np.minimum(floor, (1 - NEARLY_ALL) * direction[:, 0]))
     shaken = w < floor
     # at rest: much slower than an exponential approach with this gain
-    rest = np.abs(before - w) < AT_REST * w * (1 - np.exp(-loop.gain * n / loop.rate))
+    approach = w * (1 - np.exp(-loop.gain * n / loop.rate))
+    rest = np.abs(before - w) < ARRIVED_DISTANCE_SHARE * approach
     same = e < ARRIVED_DISTANCE_SHARE * error[:, 0]
     worse = w > direction[:, 0]
     return [_end(*case) for case in zip(arrived, shaken, same, rest, worse, strict=True)]

@@ -34,7 +34,7 @@ from pkmcal.solver.kernels import cauchy_weights
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a measured and a predicted leg, median over the legs, up to which the assembly mode
 is the expected one: a hand-measured camera pose is right to a few degrees, other assembly modes
-differ by tens of degrees."""
+differ by tens of degrees. Not checked within a factor of two."""
 SHADING_EDGE_SHIFT = 0.1
 """Shift of a whole edge, in pixels after binning, in addition to its own sigma: shading that the
 edge model omits (docs/observation.md measures 0.14 and 0.22 px per sample)."""
@@ -48,7 +48,8 @@ determine those."""
 LEG_EDGE_SIDES = np.array([0, 1])
 LOST_EDGE_DISTANCE = 0.7
 """Median distance, in px, of edges from their prediction above which all are rejected: if legs
-turned by more than that, the ends that are still within reach would pass for whole edges."""
+turned by more than that, the ends that are still within reach would pass for whole edges. Not
+checked within a factor of two."""
 SEARCH_ROUNDS = 3
 """Gauss-Newton steps of the pose after a search: over ten pixels the problem is not linear."""
 

@@ -22,7 +22,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
-from pkmcal.levels import ALIGNED_ANGLE, NEARLY_ALL, NEGLIGIBLE
+from pkmcal.levels import ALIGNED_ANGLE, NAMED_SHARE, NEARLY_ALL, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
 from pkmcal.wording import DISPLAY_UNITS, decimals, joined, named, number, split_name, with_unit
@@ -35,8 +35,8 @@ MOST_SIZES = 3
 """Largest number of sizes that are tried together, besides all of them; the number of combinations
 grows as powers of two."""
 SMALL_PART = 0.05
-"""Share of a direction's largest number up to which another number of it is not named, and of the
-joints' spread up to which a joint lies on an axis: poses contain noise."""
+"""Share of the larger of two shifts up to which their sum is none, and of the joints' spread up to
+which a joint lies on an axis: the poses at which motions are computed contain noise."""
 MOST_VALUES_LISTED = 5
 """Largest number of terms in a sentence, the last of which may stand for all smaller ones."""
 
@@ -52,10 +52,11 @@ class UnidentifiedOptions:
     wording; no verdict depends on them.
     """
 
-    # squared cosines between a motion and the undetermined space above which the motion explains
-    # a part of that space. The larger one is applied first, since many motions are similar once
+    # squared cosines between a motion and the undetermined space above which the motion explains a
+    # part of that space. The larger one is applied first, since many motions are similar once
     # frames are removed; the smaller one allows for the noise of the poses at which the space was
-    # evaluated
+    # evaluated. They affect the wording only; not checked within a factor of two of their distance
+    # from 1
     inside: tuple[float, float] = (0.999, 0.95)
     # information in units of the prior (singular value) below which a direction counts as
     # unidentified: the data then leave nearly all of its variance, 1 / (1 + weak^2). Estimated
@@ -259,7 +260,9 @@ def _conventions(s: Situation) -> Iterator[NamedChanges]:
 def _difference(s: Situation, coefficients: Array) -> str:
     """Axes along which both ends shift, and the difference that is identifiable instead."""
     numbers = np.abs(coefficients).max(axis=0).reshape(3, -1).max(axis=1)
-    axes = [c for c, x in zip(AXIS_LETTERS, numbers, strict=True) if x > SMALL_PART * numbers.max()]
+    axes = [
+        c for c, x in zip(AXIS_LETTERS, numbers, strict=True) if x > NAMED_SHARE * numbers.max()
+    ]
     layout = s.machine.layout
     base, platform = (
         joined(list(dict.fromkeys(f"the {g.carrier.called}" for g in groups_)))

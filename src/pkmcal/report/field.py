@@ -39,8 +39,6 @@ FIELD_EDGE_FRACTIONS = np.linspace(0.05, 0.95, 10)
 """Positions on an edge, as fractions of its span: an edge crosses several cells."""
 FIELD_CELLS_ACROSS = 14
 """Cells across the image."""
-FEWEST_IN_A_CELL = 5
-"""Fewest edges and corner coordinates in a cell that is shown."""
 LEAST_WEIGHT_ACROSS = np.sin(np.deg2rad(15.0)) ** 2
 """Least share of a cell's information in a direction in which the shift is shown.
 
@@ -320,7 +318,7 @@ def _cells(
         np.stack([cells % FIELD_CELLS_ACROSS, cells // FIELD_CELLS_ACROSS], axis=-1) + 0.5
     ) * side - 0.5
     out: list[blocks.Arrow] = []
-    for c in np.flatnonzero(n >= FEWEST_IN_A_CELL).tolist():
+    for c in np.flatnonzero(n > rank).tolist():
         here = first[number_of == c]
         (x, y), (right, down) = places[c].tolist(), shift[c].tolist()
         upright = (upright_turn(quarter_turns) @ shift[c]).tolist()

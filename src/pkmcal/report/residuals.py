@@ -12,6 +12,7 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.levels import NOISE_EXCESS, OUTLIER_SIGMAS
 from pkmcal.measurements import EdgeSet
+from pkmcal.measurements.edges import SHADING_SIGMA
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.overlays import EDGE_SIDE_NAMES
 from pkmcal.observe.predict import legs_in_camera
@@ -36,11 +37,6 @@ from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import count, joined, named, number
 
-SHADED_MEAN_SHIFT = 0.05
-"""Mean outward shift, px, above which a sentence reports it.
-
-Shading moves edges by this and more.
-"""
 SIGMAS_IN_WORDS = "standard deviations"
 HISTOGRAM_HALF_SPAN = 5.0
 """Standard deviations that the histogram spans on either side."""
@@ -373,7 +369,7 @@ def _shaded(edges: EdgeSet, estimate: Estimate, shifts: Array) -> list[str]:
         if len(finite_shifts) < 4:
             continue
         mean, error = finite_shifts.mean(), finite_shifts.std(ddof=1) / np.sqrt(len(finite_shifts))
-        if abs(mean) > max(SHADED_MEAN_SHIFT, OUTLIER_SIGMAS * error):
+        if abs(mean) > OUTLIER_SIGMAS * np.hypot(SHADING_SIGMA, error):
             where = f"leg {leg + 1} tube {tube + 1} {EDGE_SIDE_NAMES[side]}"
             shaded.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
     return [text for _, text in sorted(shaded, reverse=True)[:4]]

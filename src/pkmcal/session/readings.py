@@ -205,8 +205,8 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
 
 
 def largest_range(count: int) -> float:
-    """Range, in standard deviations, of repeated readings that noise exceeds in one session of
-    1 / FALSE_ALARM.
+    """Range of repeated readings of one column, in standard deviations, that noise exceeds with the
+    probability FALSE_ALARM at most.
 
     By Bonferroni's inequality for all pairs of readings: 4.9 for 5, 5.9 for 20, 6.9 for 100.
     """
