@@ -35,6 +35,7 @@ from pkmcal.camera_calibration.model_selection import (
     is_worse,
     line_offsets,
     positions,
+    spread_of_views,
     starting_cameras,
 )
 from pkmcal.camera_calibration.uncertainty import board_motion, projection_covariance
@@ -415,6 +416,19 @@ def test_single_bad_corners_do_no_harm(true):
     off = (calibration.camera.parameters - true.parameters)[free] / calibration.sigma[free]
     assert np.abs(off[:5]).max() < 4
     assert any("20 of 480 corners" in text for text in calibration.warnings)
+
+
+@pytest.mark.parametrize("count", [4, 10])
+def test_views_of_a_right_camera_do_not_disagree(count):
+    """The changes without single views are far larger than sigma where there are few."""
+    true = TRUE["pinhole"]
+    free = positions(true, TERMS["pinhole"])
+    spreads = []
+    for seed in range(20):
+        poses = poses_for(true, count, seed)
+        views = views_of(detections(true, poses, seed), BOARD)
+        spreads.append(spread_of_views(fit_camera(true, free, views, poses), views))
+    assert np.sum(np.array(spreads) > 1) <= 1
 
 
 def test_views_that_disagree_widen_sigma():

@@ -18,6 +18,7 @@ from pkmcal.files import csv_text, parse_yaml, validated_document, yaml_text
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.start import start_state
 from pkmcal.judge.watch import watch_machine
+from pkmcal.levels import FALSE_ALARM
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import (
     MechanismDocument,
@@ -29,6 +30,7 @@ from pkmcal.mechanisms import (
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.report.calibration import outcome_of, save
 from pkmcal.session.load import load_session, load_session_to_plan
+from pkmcal.session.readings import unmoved_readings
 from pkmcal.simulation.truth import true_machine
 from pkmcal.web.report_page import report_document
 
@@ -231,6 +233,13 @@ def test_repeats_of_a_pose_count_once(tmp_path):
     calibration = calibrate_session(session).estimate
     sigma = [np.sqrt(np.trace(e.covariance)) for e in (once, calibration)]
     assert sigma[1] == pytest.approx(sigma[0], rel=0.1)
+
+
+@pytest.mark.parametrize("count", [3, 20, 200])
+def test_readings_that_repeat_have_moved_once_in_two_hundred(count):
+    """The range of noise grows with the number of readings."""
+    joints = np.random.default_rng(3).normal(0, NOISE, (count, 4000))
+    assert np.mean(~unmoved_readings(joints, NOISE)) == pytest.approx(FALSE_ALARM, abs=0.0035)
 
 
 def test_a_machine_without_redundancy_is_refused(tmp_path):

@@ -19,13 +19,14 @@ from pkmcal.identify.motions import Situation, sizes
 from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
 from pkmcal.identify.unidentified import conventions_held, explain
 from pkmcal.identify.verdict import assess
+from pkmcal.levels import INSEPARABLE_CORRELATION
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.report import correlation_plot
 from pkmcal.report.identifiability import held_text as held_in_words
 from pkmcal.report.identifiability import tied as tied_in_words
-from pkmcal.report.parameters import TIGHT_CORRELATION, bound_together, grouped, tight_pairs
+from pkmcal.report.parameters import bound_together, grouped, tight_pairs
 from pkmcal.solver.search import Stop
 from pose_sessions import estimated, measured, papers_poses, upright
 
@@ -246,7 +247,7 @@ def test_what_the_picture_of_correlations_states_fits_the_sentences_on_pairs(nam
     part = correlation_plot.section(estimate)
     cells = next(mark for mark in part.blocks[0].marks if mark.mark == "cells")
     closest = float(re.search(r", ([+−]\d\.\d\d)\.", part.text[0])[1].replace("−", "-"))
-    assert bool(text) == (abs(closest) > TIGHT_CORRELATION)
+    assert bool(text) == (abs(closest) > INSEPARABLE_CORRELATION)
     for i, j, rho in tight_pairs(estimate)[:1]:
         assert (
             f"{table.in_words(table.names[i])} and {table.in_words(table.names[j])}" in part.text[0]

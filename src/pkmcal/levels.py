@@ -3,6 +3,7 @@ more than noise.
 
 Probabilities of false alarms are in :mod:`pkmcal.identify.false_alarm` and, of hypotheses, in
 :mod:`pkmcal.outcome.hypotheses`. Limits of one algorithm are fields of its options.
+Half or twice a level was tried only where its docstring gives the result.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ MAJORITY = 0.5
 """Share beyond which more are than are not."""
 NEARLY_ALL = 0.9
 """Share from which the rest does not matter: a tenth less changes a standard deviation by 5 %."""
+INSEPARABLE_CORRELATION = NEARLY_ALL**0.5
+"""Correlation from which two numbers are hardly distinguished: one explains nine tenths of the
+other's variance, and their combination is known 3.2 times better than each alone."""
 CAUSE_SHARE = 0.3
 """Share of an effect from which a single cause is named beside others."""
 NAMED_SHARE = 0.15
@@ -50,6 +54,9 @@ FEWEST_EDGES = 24
 """Minimum number of edges of an estimate; a single image of a hexapod has as many."""
 RELEVANT_FACTOR = 1.2
 """Factor on a standard deviation that matters: that of half as many images in addition."""
+RELEVANT_SHARE = (1 - RELEVANT_FACTOR**-2) ** 0.5
+"""Share of a standard deviation by one cause without which it would be smaller by
+``RELEVANT_FACTOR``."""
 ALIGNED_ANGLE = radians(10.0)
 """Angle (rad) to an axis or a plane within which a direction has its name."""
 TRANSLATION_TURN = radians(3.0)

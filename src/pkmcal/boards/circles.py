@@ -44,7 +44,9 @@ class CircleOptions:
     # least difference between circle and paper, in standard deviations of the paper
     least_contrast: float = CONTRADICTION_SIGMAS
     # largest fourth harmonic of a circle's outline, weighted by the fourth power of the radius; a
-    # square has 0.43 (derived)
+    # square has 3/7 (derived). Of simulated grids with pitches of 10 and 20 px, blurs of 0.7 and
+    # 1.8 px and noise of 1 and 4 levels (32 images of either kind), it keeps 90 % of the circles
+    # and 73 % of squares; 3/14 keeps 85 and 66 %, no limit 93 % of both
     most_angular: float = 0.25
 
 

@@ -33,7 +33,7 @@ from pkmcal.boards.layout import (
 from pkmcal.boards.saddles import is_large_enough, largest_block
 from pkmcal.errors import InputError
 from pkmcal.files import Document
-from pkmcal.levels import NEARLY_ALL
+from pkmcal.levels import MAJORITY, NEARLY_ALL
 from pkmcal.observe.images import decode, narrowed
 from pkmcal.outcome.progress import Progress, no_progress
 from pkmcal.session.image_files import image_header
@@ -55,11 +55,12 @@ class OtherBoardOptions:
     width: int = 512
     # share of the corners inside another chessboard of which all neighbours must be seen: all its
     # corners must be fitted, and a corner not seen costs up to nine
-    visible_share: float = 0.5
+    visible_share: float = MAJORITY
     # least relative difference between measured and described markers: corners of markers are
     # located to about half a pixel, a twentieth of the smallest markers used (derived)
     size_difference: float = 0.1
-    # fewest markers for a measurement of their size, and for another dictionary
+    # fewest markers for a measurement of their size, and for another dictionary; not checked with
+    # other numbers
     least_markers: int = 4
     # most outlines of markers that are compared with all dictionaries, the largest first
     most_outlines: int = 24

@@ -32,7 +32,15 @@ from pkmcal.solver.ranks import column_space
 
 @dataclass(frozen=True)
 class BoardDetectionOptions:
-    """Constants of the detection of a board's corners and of their fit."""
+    """Constants of the detection of a board's corners and of their fit.
+
+    Of 18 simulated images of chessboards and ChArUco boards (640x480 px, tilts up to 55 degrees,
+    blur 0.5 to 3.5 px, fingers, shadows, noise 0.5 to 5 grey levels) 11 are detected, and of 6 with
+    windows, another chessboard or random squares none. Half and twice of ``blur_range``, of the
+    share that ``least_explained`` leaves, of ``whole_share`` (at most 0.875), ``visible_share``,
+    ``dark_border`` (at most 0.85), ``least_light`` and ``marker_contrast`` leave these numbers as
+    they are, and so does twice ``bend``; with half of it one image less is detected.
+    """
 
     # most steps of a corner's fit
     steps: int = 12

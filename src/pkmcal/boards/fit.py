@@ -37,7 +37,8 @@ LEAST_NOISE = 1e-4
 class CameraFitOptions:
     """Constants of the fit of a camera and of a board's poses."""
 
-    # views in which a corner has to lie at another one's place before its number is wrong
+    # views in which a corner has to lie at another one's place before its number is wrong: in one,
+    # it is an outlier. Not checked with more
     least_views: int = 2
     # corners that one wrong marker, such as another thing's, puts elsewhere in all views
     marker_corners: int = 4

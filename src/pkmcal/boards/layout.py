@@ -24,16 +24,19 @@ from pkmcal.levels import NEARLY_ALL
 class MarkerLayoutOptions:
     """Constants of the layout of markers."""
 
-    # largest distance of a neighbour from its lattice point, in pitches
+    # largest distance of a neighbour from its lattice point, in pitches: half of that to the next
+    # cell. Not checked within a factor of two
     misfit: float = 0.25
     # shortest side of a marker, px; corners are located to about half a pixel, a twentieth of it
     least_side: float = 10.0
-    # fewest pairs of neighbours that determine the step of the ids along rows or columns
+    # fewest pairs of neighbours that determine the step of the ids along rows or columns; not
+    # checked with other numbers
     least_neighbours: int = 4
     # least share of the pairs that agree on a step; misread ids are rare
     agreement: float = NEARLY_ALL
     # fewest contradictions to a described numbering, pairs of row neighbours in different rows or
-    # ids out of range, for which it is wrong
+    # ids out of range, for which it is wrong: a single one may be a misread id. Not checked with
+    # more
     contradictions: int = 2
 
 

@@ -59,12 +59,12 @@ class BoardPoseOptions:
     tilt_chi2: float = CONTRADICTION_SIGMAS**2
     # difference between two images of a still board allowed beyond noise, px rms over the board. A
     # camera on a tripod keeps a tenth of a pixel; smaller movements hardly matter for edges of
-    # legs, which are as uncertain
+    # legs, which are as uncertain. Not checked within a factor of two
     still: float = 0.2
-    # standard deviations of the images' own noise allowed in addition (statistical: 6 in 10^5 by
-    # chance)
-    moved: float = 4.0
-    # largest share of single images that disagree; with more, the board never stood still
+    # standard deviations of the images' own noise allowed in addition
+    moved: float = CONTRADICTION_SIGMAS
+    # largest share of single images that disagree; with more, the board never stood still. Two
+    # consecutive ones are a movement in any case. Not checked within a factor of two
     most_outlying: float = 1 / 3
     # largest share of a pose's covariance that repeats have in common (numerical: keeps the rest
     # invertible)

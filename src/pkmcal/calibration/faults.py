@@ -39,14 +39,9 @@ from pkmcal.session.load import Session
 from pkmcal.session.readings import rounding_step
 from pkmcal.wording import listed
 
-BOARD_SIZE_DISAGREEMENT = 2.0
-"""Standard deviations between a board's size by its file and by all other data from which a note
-reports both: by chance one session of twenty."""
 WRONG_MODEL_READING_SCALE = 100.0
 """Factor on the readings' stated noise above which the scatter is a model error: mounted encoders
 are ten or thirty times as noisy as in their data sheets."""
-FEWEST_POSES = 4
-"""Smallest number of whole poses of one station for a test of the platform's rotation."""
 
 
 def wrong_scale(estimate: Estimate) -> float:
@@ -244,7 +239,7 @@ def size_notes(
         # the prior, which is the file's, is removed: 1 / other is the factor on the estimate
         other = max(1 - (sigma / tolerance) ** 2, np.finfo(float).eps)
         facts = {"tolerance": 100 * tolerance}
-        if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT * tolerance:
+        if abs(value) / np.sqrt(other) > OUTLIER_SIGMAS * tolerance:
             facts |= {"value": value / other, "sigma": sigma / np.sqrt(other)}
             yield note("board.size_disagrees", file, **facts)
         else:
@@ -295,9 +290,9 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Fin
     out: list[Finding] = []
     for s in np.unique(poses.station[whole]).tolist():
         part = poses.select(whole & (poses.station == s))
-        if len(part) < FEWEST_POSES:
-            continue
         axis = rotation_axis(part, motion)
+        if not axis.dof:
+            continue
         name = session.station_names[s]
         off, noise = (
             float(np.rad2deg(np.sqrt(np.mean(tilt**2)))) for tilt in (axis.tilt, axis.expected_tilt)

@@ -597,7 +597,7 @@ def inconsistent_poses(
     poses = measurements.poses.station
     # trackers are numbered after the cameras
     by_board = np.bincount(poses, estimate.pose_weights, len(session.stations))
-    by_board = by_board[: len(session.stations)] >= 0.5
+    by_board = by_board[: len(session.stations)] >= INLIER_WEIGHT
     visible = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
     used = measured & (estimate.edge_weights >= INLIER_WEIGHT)
     visible[station[used], measurements.edges.leg[used]] = True

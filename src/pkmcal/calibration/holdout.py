@@ -23,15 +23,16 @@ from pkmcal.session.readings import same_pose
 from pkmcal.wording import count, listed
 
 FEWEST_TO_CALIBRATE = 3
-"""Fewest configurations from which a calibration is meaningful."""
+"""Fewest configurations from which a calibration is meaningful. Whether it is, its own verdict
+decides; not checked with other numbers."""
 
 MOST_CLUSTERING_ROUNDS = 100
 """Upper bound of the k-means iterations."""
 TIE = 1e-6
 """Difference of distances, as a share of the points' extent, that counts as none."""
-NAMED_REGION_OFFSET = 0.7
-"""Offset of a region from the middle, in standard deviations of the whole workspace, from which
-a direction is part of its name."""
+NAMED_REGION_OFFSET = 3**-0.5
+"""Offset of a region from the middle, in standard deviations of the whole workspace, from which a
+direction is part of its name: a third of half the range of evenly spread configurations."""
 REGION_DIRECTION_NAMES = (
     ("turned about −x", "turned about +x"),
     ("turned about −y", "turned about +y"),

@@ -51,7 +51,9 @@ from pkmcal.session.load import Session
 Family = Callable[[Session, Observation, Measurements, Estimate], Iterable[Column]]
 """Columns of model violations that share a part of the false-alarm level."""
 MOST_TOOL_SHIFT = 1.0
-"""Shift of the tool by a violation, in standard deviations, above which the result is refused."""
+"""Shift of the tool by a violation, in standard deviations, above which the result is refused: the
+error is then, by root mean square, 1.4 times the stated standard deviation, with half the limit
+1.12 and with twice 2.2 times."""
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,8 @@ class RefinementOptions:
     # changes the machine by four or more
     settled_change: float = 2.0
     # the same for ending after the second pass: if that changes the machine by more, a further pass
-    # reduces the remaining dependence on the starting point to a quarter
+    # reduces the remaining dependence on the starting point to a quarter. With half of it most
+    # machines would need a third pass; not checked with twice
     early_settled_change: float = 1.0
     # median distance (px) of edges from their prediction below which a further pass changes
     # nothing: the first pass corrects a pixel, the second the remaining effect of shading, and

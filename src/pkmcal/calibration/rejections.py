@@ -22,8 +22,9 @@ from pkmcal.session.load import Session
 from pkmcal.wording import count, listed
 
 LEAST_CHECKED_SHARE = 0.1
-"""Smallest mean redundancy of the links (degrees of freedom per equation): below it, an outlier
-of up to ``4.13 / sqrt(0.1)``, thirteen, standard deviations is not detected (Baarda 1968)."""
+"""Smallest mean redundancy of the links (degrees of freedom per equation), below which there is a
+warning: an outlier of up to ``4.13 / sqrt(0.1)``, thirteen, standard deviations is not detected
+(Baarda 1968). With half the limit it is eighteen, with twice nine."""
 
 
 def rejection_findings(

@@ -37,10 +37,12 @@ class ToolMapOptions:
     # extension of the slices beyond those poses to either side, as a share of their range
     margin: float = 0.08
     # fewest rows and columns of cells, and smallest share of reachable cells among these, for a
-    # slice: a platform that can only shift as it rotates has one orientation in few places
+    # slice: a platform that can only shift as it rotates has one orientation in few places. They
+    # decide what is drawn, not the figures; not checked within a factor of two
     least_cells: int = 3
     least_filled: float = 0.4
-    # largest distance, in cells, by which rods and axes may put a pose off its cell's middle
+    # largest distance, in cells, by which rods and axes may put a pose off its cell's middle: half
+    # a cell would mix up neighbours
     most_off_middle: float = 0.25
 
 

@@ -50,8 +50,8 @@ from pkmcal.files import closest, json_value
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.levels import (
     FALSE_ALARM,
+    INSEPARABLE_CORRELATION,
     MAJORITY,
-    NEARLY_ALL,
     NEGLIGIBLE,
     OUTLIER_SIGMAS,
     UNEXPLAINED_SCALE,
@@ -66,23 +66,29 @@ from pkmcal.wording import listed
 class CalibrationCheckOptions:
     """Thresholds of the checks of a camera calibration."""
 
-    # fewest images that show the board
+    # fewest images that show the board: each gives two equations for the five intrinsics of a
+    # camera without distortion (Z. Zhang, 2000)
     least_views: int = 3
-    # number of images below which a warning is given
+    # number of images below which a warning is given. Of a simulated pinhole with 54 corners of 0.1
+    # px and tilts up to 30 degrees (12 seeds), the focal length has a standard deviation of 0.2 %
+    # with 3 images, 0.1 % with 6 and 0.07 % with 12
     good_views: int = 6
     # ratio of held-out errors above which a model named by the user is refused; a smaller
     # significant ratio gives a warning
     unfit_ratio: float = UNEXPLAINED_SCALE
     # largest standard deviation of the focal length, as a share of it; a machine of 1 m would be
-    # off by 2 cm
+    # off by 2 cm. In the same simulation, 3 images tilted by at most 7.5 degrees have 1.7 %, in the
+    # worst case 2.7 %; all images tilted by 15 degrees or more have less than half of the limit
     least_sure: float = 0.02
     # largest share of rejected corners. Their noise is estimated from the better half of all
-    # corners, which does not represent the rest if its errors are of another kind
+    # corners, which does not represent the rest if its errors are of another kind. Not checked
+    # within a factor of two
     most_lost: float = 0.25
     # ratio of a view's held-out error to the median of all views above which the view is reported
     outlying_view: float = OUTLIER_SIGMAS
     # tilt of a board in degrees below which views all have the same information on the focal
-    # length, which is little
+    # length, which is little: in the same simulation of 6 images, a standard deviation of 1 % up to
+    # 7.5 degrees, 0.3 % up to 15 and 0.1 % up to 30
     facing_tilt: float = 15.0
     # most steps in which a board's bend and the rest are estimated in turn; two or three suffice
     bend_steps: int = 10
@@ -98,8 +104,6 @@ class CalibrationCheckOptions:
 CALIBRATION_CHECK_OPTIONS = CalibrationCheckOptions()
 UNCERTAINTY_CELLS = (32, 24)
 """Columns and rows of cells in which the projection's uncertainty is computed."""
-STRONG_CORRELATION = NEARLY_ALL**0.5
-"""Correlation from which two intrinsics are reported as hardly separable."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +192,7 @@ class CameraCalibration:
             (names[i], names[j], float(rho[i, j]))
             for i in range(len(names))
             for j in range(i + 1, len(names))
-            if abs(rho[i, j]) >= STRONG_CORRELATION
+            if abs(rho[i, j]) >= INSEPARABLE_CORRELATION
         ]
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
@@ -293,7 +297,7 @@ def calibrate_camera(
     # Covariance, scaled by the disagreement of the views.
     beside = rows_of(fit, views, bend_of(board)) if bend else None
     by_noise, poses_by_noise, by_intrinsics = covariance_of(fit, views, beside)
-    spread = spread_of_views(fit, views, selection)
+    spread = spread_of_views(fit, views)
     covariance = by_noise * spread**2
     check_determined(fit, covariance, views, options=options)
     # Test on held-out views.

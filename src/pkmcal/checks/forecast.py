@@ -27,7 +27,8 @@ from pkmcal.planning.information import tool_by_free
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
 
 NEAR_END = 0.15
-"""Part of a joint's range, at either end, whose readings count as extreme."""
+"""Part of a joint's range, at either end, whose readings count as extreme; notes alone depend on
+it. Not checked within a factor of two."""
 SECOND_STATION_TURN = np.pi / 2
 """Angle around the machine of a second station, rad: the direction that one camera determines
 worst, along its line of sight, the other determines best.

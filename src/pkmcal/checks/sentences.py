@@ -27,12 +27,14 @@ from pkmcal.session.readings import same_pose
 from pkmcal.wording import DISPLAY_UNITS, Chance, count, listed, number, with_unit
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
-"""Share of saturated pixels on the legs above which edges are lost; a highlight covers a tenth."""
+"""Share of saturated pixels on the legs above which edges are lost; a highlight covers a tenth. Not
+checked within a factor of two."""
 BLUR_STILL_MEASURED = RELEVANT_FACTOR * PROFILE_OPTIONS.blur_range[1]
 """Blur (px) beyond which edges are measured badly: the widest that the model of an edge tries, by
 the factor that matters."""
 POOR_CORNERS = 0.5
-"""Residual of corners (px rms) beyond that of any sharp image of a flat board."""
+"""Residual of corners (px rms) beyond that of any sharp image of a flat board. Not checked within a
+factor of two."""
 STATION_COLUMNS = {
     "Station": "",
     "Images": "",

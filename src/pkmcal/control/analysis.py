@@ -9,11 +9,10 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.control.laws import task_of
 from pkmcal.control.machine_view import MachineView, legs_at, moved_to, true_edges
+from pkmcal.levels import NEARLY_ALL
 
 UNSEEN_MOTION_VISIBILITY = 1e-6
 """Visibility below which a motion is unobservable; rounding leaves 1e-9."""
-FADING_VISIBILITY_SHARE = 0.1
-"""Share of the median visibility below which a pose is close to one with an unobservable motion."""
 
 
 def matrix_at(view: MachineView, law: str, poses: Array) -> Array:
@@ -54,5 +53,5 @@ class Visibility:
 
     @property
     def fading(self) -> bool:
-        """Whether some motion is hardly observable at some poses."""
-        return self.worst < FADING_VISIBILITY_SHARE * self.usual
+        """Whether nearly all of the median visibility is lost at some poses."""
+        return self.worst < (1 - NEARLY_ALL) * self.usual

@@ -25,6 +25,9 @@ from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.velocities import sign_of
 from pkmcal.wording import named
 
+GOAL_TOLERANCE = 5e-4
+"""Distance from the goal of the readings (m or rad), and of the platform's joints (m), that counts
+as none: one image of 640x480 pixels determines a reading to 0.3 mm."""
 UNIT_LENGTH_TOLERANCE = 1e-6
 """Difference of a normal's length from 1 that rounding to six written digits may cause."""
 

@@ -16,6 +16,7 @@ from pkmcal.cameras import Camera
 from pkmcal.control.machine_view import MachineView, visible_tubes
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot
+from pkmcal.levels import MAJORITY
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -28,8 +29,6 @@ from pkmcal.placement.edges import EdgeNoise, disturbed, responses
 
 IMAGED_EDGE_POINTS = 5
 """Samples along an edge; more samples change its noise by less than a tenth."""
-IN_VIEW = 0.5
-"""Share of a leg's edge that must be in the image; with less, a tracker loses the leg."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +61,11 @@ class Eye:
         return edge_points(self.true.machine, self.camera, legs, self.tubes, places)
 
     def in_view(self, points: EdgePoints) -> Booleans:
-        """(R, s) legs with at least IN_VIEW of both edges in the image."""
+        """(R, s) legs with most of both edges in the image."""
         with np.errstate(invalid="ignore"):
             inside = points.valid & self.camera.in_image(points.pixel)
         share = inside.mean(axis=-1)
-        return (share >= IN_VIEW).reshape(*share.shape[:-1], -1, 2).all(axis=-1)
+        return (share >= MAJORITY).reshape(*share.shape[:-1], -1, 2).all(axis=-1)
 
     def hidden(self, poses: Array, readings: Array) -> Booleans:
         """(R, s) legs with more than half of an edge behind another leg."""
@@ -77,7 +76,7 @@ class Eye:
         with np.errstate(invalid="ignore"):
             inside = points.valid & self.camera.in_image(points.pixel, margin=4.0)
         share = (inside & ~clear).mean(axis=-1)
-        return (share > 1 - IN_VIEW).reshape(*share.shape[:-1], -1, 2).any(axis=-1)
+        return (share > MAJORITY).reshape(*share.shape[:-1], -1, 2).any(axis=-1)
 
     def normals(self, points: EdgePoints, noise: EdgeNoise, rng: np.random.Generator) -> Array:
         """Measured normals (R, s, 2, 3), camera frame."""

@@ -11,6 +11,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.control.goal import (
+    GOAL_TOLERANCE,
     Goal,
     GoalImage,
     Status,
@@ -48,6 +49,7 @@ from pkmcal.control.track import (
 )
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import dot, inverse
+from pkmcal.levels import CONTRADICTION_SIGMAS, OUTLIER_SIGMAS
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe.legs import first_binning
@@ -55,22 +57,18 @@ from pkmcal.wording import named
 
 __all__ = ["GoalImage", "Status", "Step", "VisualServo"]
 
-GOAL_READING_TOLERANCE = 5e-4
-"""Difference of a reading, in m or rad, from the goal's that counts as converged: one image of
-640x480 pixels determines it to 0.3 mm."""
-UNEXPLAINED_READINGS_LAG = 3 * READINGS_LAG_SIGMA
+UNEXPLAINED_READINGS_LAG = OUTLIER_SIGMAS * READINGS_LAG_SIGMA
 """Difference, in metres, between an image and its readings that a control loop's delay does not
 explain."""
 VAGUE_DISTANCE_TOLERANCES = 4.0
 """Standard deviation of a reading's distance to the goal, in tolerances, above which there is a
-warning."""
-AT_GOAL_DEVIATIONS = 5.0
-"""RMS of the law's error, in standard deviations, below which a machine at rest is at its goal."""
+warning; the loop goes on. Not checked within a factor of two."""
 UNSEEN_READING_SIGMA = 0.05
-"""Standard deviation of a reading, in m or rad, above which an image does not determine it."""
+"""Standard deviation of a reading, in m or rad, above which an image does not determine it, and the
+loop stops. Not checked within a factor of two."""
 OTHER_POSITION_ANGLE = 0.02
 """RMS angle, in rad, that is more than noise: with readings at rest and edges this far from the
-goal, the law has reached another equilibrium."""
+goal, the law has reached another equilibrium. Not checked within a factor of two."""
 NO_EDGES_TEXT = (
     "likely causes: another assembly than the start's, readings of another image, a camera"
     " that was moved, too little light"
@@ -131,7 +129,7 @@ class VisualServo:
         rate_limits: float | Array | None = None,
         legs: Integers | None = None,
         start: Array | None = None,
-        tolerance: float = GOAL_READING_TOLERANCE,
+        tolerance: float = GOAL_TOLERANCE,
         period: float = 0.0,
         edge_shift: float = 0.0,
         binning: int | None = None,
@@ -305,7 +303,7 @@ class VisualServo:
         still = bool(np.max(np.abs(off)) <= self.tolerance)
         # a single direction has more noise than that angle: compare images in standard deviations
         typical = _root_mean_square(task.error / np.sqrt(3)) / noise if has_noise else np.inf
-        converged = still and (error < OTHER_POSITION_ANGLE or typical < AT_GOAL_DEVIATIONS)
+        converged = still and (error < OTHER_POSITION_ANGLE or typical < CONTRADICTION_SIGMAS)
         warnings = self._warnings(sample, used, slowed, outside)
         if still and not converged:
             elsewhere = (

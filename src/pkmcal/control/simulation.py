@@ -13,10 +13,12 @@ from enum import Enum
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.control.goal import GOAL_TOLERANCE
 from pkmcal.control.image import Eye
 from pkmcal.control.laws import MatrixPlace, joint_velocities, law_named, limited, solution, task_of
 from pkmcal.control.machine_view import MachineView, directions_of, legs_from_image
 from pkmcal.geometry.rigid import dot
+from pkmcal.levels import NEARLY_ALL, OUTLIER_SIGMAS
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, closure_at, forward
 from pkmcal.mechanisms.velocities import assembly_sign
@@ -28,19 +30,8 @@ IMAGES_A_GOAL = 24
 ARRIVED_DISTANCE_SHARE = 0.02
 """Distance from the goal, relative to the path's length, of a platform that has arrived: 2 %, as
 usual for settling times."""
-LEAST_DISTANCE = 5e-4
-"""Distance of the platform's joints, in metres, within which a goal is reached however short the
-path."""
 FINAL_RUN_SHARE = 0.1
 """Share of a run, at its end, whose mean decides how the run ended."""
-AT_GOAL_NOISE_DEVIATIONS = 3.0
-"""Distance from the goal, in standard deviations of the noise there, within which a platform has
-arrived."""
-TREMBLING_DISTANCE_SHARE = 0.1
-"""Distance from the goal, relative to the path's length, above which a run has not arrived,
-whatever the noise."""
-AT_REST = 0.02
-"""Velocity, relative to that of an exponential approach, below which a run is at rest."""
 AT_STOP = 1e-9
 """Distance, in m or rad, by which rounding may put a reading beyond its range."""
 NO_EDGE_NOISE = EdgeNoise(shift=0.0, tilt=0.0)
@@ -428,9 +419,7 @@ def _floor(
     """Distance (R,), in m, of the platform's joints from the goal that is due to noise alone."""
     still = one_image(eye, eye.true, loop.law, goals, readings, loop.noise, rng, draws=8)
     part = loop_factor(loop.gain / loop.rate, loop.delay)
-    return np.nan_to_num(
-        AT_GOAL_NOISE_DEVIATIONS * still.joints * (part if np.isfinite(part) else 0.0)
-    )
+    return np.nan_to_num(OUTLIER_SIGMAS * still.joints * (part if np.isfinite(part) else 0.0))
 
 
 def _judged(error: Array, direction: Array, loop: LoopSettings, floor: Array) -> list[End]:
@@ -442,11 +431,13 @@ def _judged(error: Array, direction: Array, loop: LoopSettings, floor: Array) ->
     e, w = error[:, -n:].mean(axis=1), direction[:, -n:].mean(axis=1)
     before = direction[:, -2 * n : -n].mean(axis=1) if error.shape[1] >= 2 * n else w
     # arrived : near the goal, or as near as noise allows. shaken : noise keeps the platform away
-    near = np.maximum(ARRIVED_DISTANCE_SHARE * direction[:, 0], LEAST_DISTANCE)
-    arrived = w < np.maximum(near, np.minimum(floor, TREMBLING_DISTANCE_SHARE * direction[:, 0]))
+    near = np.maximum(ARRIVED_DISTANCE_SHARE * direction[:, 0], GOAL_TOLERANCE)
+    # with nearly all of its path behind it
+    arrived = w < np.maximum(near, np.minimum(floor, (1 - NEARLY_ALL) * direction[:, 0]))
     shaken = w < floor
     # at rest: much slower than an exponential approach with this gain
-    rest = np.abs(before - w) < AT_REST * w * (1 - np.exp(-loop.gain * n / loop.rate))
+    approach = w * (1 - np.exp(-loop.gain * n / loop.rate))
+    rest = np.abs(before - w) < ARRIVED_DISTANCE_SHARE * approach
     same = e < ARRIVED_DISTANCE_SHARE * error[:, 0]
     worse = w > direction[:, 0]
     return [_end(*case) for case in zip(arrived, shaken, same, rest, worse, strict=True)]

@@ -19,6 +19,7 @@ from pkmcal.control.machine_view import MachineView, directions_of, leg_ends_in_
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, perturb, pose_difference, skew
+from pkmcal.levels import UNEXPLAINED_SCALE
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
@@ -33,7 +34,7 @@ from pkmcal.solver.kernels import cauchy_weights
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a measured and a predicted leg, median over the legs, up to which the assembly mode
 is the expected one: a hand-measured camera pose is right to a few degrees, other assembly modes
-differ by tens of degrees."""
+differ by tens of degrees. Not checked within a factor of two."""
 SHADING_EDGE_SHIFT = 0.1
 """Shift of a whole edge, in pixels after binning, in addition to its own sigma: shading that the
 edge model omits (docs/observation.md measures 0.14 and 0.22 px per sample)."""
@@ -44,12 +45,11 @@ READINGS_LAG_SIGMA = 0.001
 """Standard deviation, in metres, between a reading and the image: 50 mm/s for 20 ms between the
 two. Edges determine some motions of the platform a hundred times worse than others; readings
 determine those."""
-ONE_LEG_MISFIT = 16.0
-"""Mean squared misfit, in variances, above which edges are not those of one leg."""
 LEG_EDGE_SIDES = np.array([0, 1])
 LOST_EDGE_DISTANCE = 0.7
 """Median distance, in px, of edges from their prediction above which all are rejected: if legs
-turned by more than that, the ends that are still within reach would pass for whole edges."""
+turned by more than that, the ends that are still within reach would pass for whole edges. Not
+checked within a factor of two."""
 SEARCH_ROUNDS = 3
 """Gauss-Newton steps of the pose after a search: over ten pixels the problem is not linear."""
 
@@ -166,7 +166,7 @@ def leg_lines(view: MachineView, rows: EdgeMisfits) -> LegLines:
     # consistency of the edges with one leg
     residual = rows.misfit - (jac @ shifted[rows.leg][..., None])[..., 0]
     square = pick @ dot(residual, (rows.information @ residual[..., None])[..., 0])
-    agrees = square < ONE_LEG_MISFIT * np.maximum(2 * pick.sum(axis=1) - 4, 1)
+    agrees = square < UNEXPLAINED_SCALE**2 * np.maximum(2 * pick.sum(axis=1) - 4, 1)
     both = np.logical_and(*(pick @ (rows.side == side) > 0 for side in LEG_EDGE_SIDES))
     a, b = (
         p + (across @ m[..., None])[..., 0]

@@ -33,6 +33,7 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.start import middle_pose
 from pkmcal.identify.state import State
+from pkmcal.levels import MAJORITY
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.poses import PoseBlocks, PoseData, pose_rows
 from pkmcal.mechanisms import Machine
@@ -45,10 +46,9 @@ DRAWN_POSE_TURN_SIGMA = 0.03
 DRAWN_POSE_SHIFT_SHARE = 0.02
 """Standard deviation of their positions, relative to the limbs' length: 10 mm of half a metre."""
 HAND_EYE_ROUNDS = 4
-UNKNOWN_CAMERA_TURN = 0.3
-"""Standard deviation (rad) of the camera's rotation above which the rotation is unidentifiable."""
 LEAST_PAIR_CONFIGURATIONS = 3
-"""Configurations in which a station must see a mount."""
+"""Configurations in which a station must see a mount: two motions about different axes determine
+both poses (R. Y. Tsai and R. K. Lenz, 1989)."""
 HAND_EYE_RANKS = (1, 2, 4)
 
 
@@ -173,7 +173,8 @@ def _check_identifiable(problem: PairProblem, pair: Pair) -> None:
     # prior as weak as a full turn
     normal = normal + np.diag(np.tile(np.repeat([0.1, 1e-3 / problem.size], 3) ** 2, 2))
     turn = np.linalg.inv(normal)[:, :3, :3]
-    if np.sqrt(np.linalg.eigvalsh(turn)[:, -1]).max() > UNKNOWN_CAMERA_TURN:
+    # a standard deviation of half a radian, as of a mount that counts as unidentified
+    if np.sqrt(np.linalg.eigvalsh(turn)[:, -1]).max() > MAJORITY:
         raise ResultError(
             what="the boards' poses do not determine how the camera stands to the machine",
             found="configurations along a line, or all alike",

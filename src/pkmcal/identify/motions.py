@@ -22,7 +22,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
-from pkmcal.levels import ALIGNED_ANGLE, NEGLIGIBLE
+from pkmcal.levels import ALIGNED_ANGLE, NAMED_SHARE, NEARLY_ALL, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
 from pkmcal.wording import DISPLAY_UNITS, decimals, joined, named, number, split_name, with_unit
@@ -34,8 +34,9 @@ form about as many."""
 MOST_SIZES = 3
 """Largest number of sizes that are tried together, besides all of them; the number of combinations
 grows as powers of two."""
-THROUGH_AXIS_DISTANCE = 0.05
-"""Distance of a joint from an axis, relative to the joints' spread, up to which it lies on it."""
+SMALL_PART = 0.05
+"""Share of the larger of two shifts up to which their sum is none, and of the joints' spread up to
+which a joint lies on an axis: the poses at which motions are computed contain noise."""
 MOST_VALUES_LISTED = 5
 """Largest number of terms in a sentence, the last of which may stand for all smaller ones."""
 
@@ -51,16 +52,17 @@ class UnidentifiedOptions:
     wording; no verdict depends on them.
     """
 
-    # squared cosines between a motion and the undetermined space above which the motion explains
-    # a part of that space. The larger one is applied first, since many motions are similar once
+    # squared cosines between a motion and the undetermined space above which the motion explains a
+    # part of that space. The larger one is applied first, since many motions are similar once
     # frames are removed; the smaller one allows for the noise of the poses at which the space was
-    # evaluated
+    # evaluated. They affect the wording only; not checked within a factor of two of their distance
+    # from 1
     inside: tuple[float, float] = (0.999, 0.95)
     # information in units of the prior (singular value) below which a direction counts as
-    # unidentified: the data then reduce its variance by less than a tenth. Estimated poses of a
-    # translational platform contain small rotations by noise, so unidentifiable directions have
-    # some spurious information
-    weak: float = 1 / 3
+    # unidentified: the data then leave nearly all of its variance, 1 / (1 + weak^2). Estimated
+    # poses of a translational platform contain small rotations by noise, so unidentifiable
+    # directions have some spurious information
+    weak: float = (1 / NEARLY_ALL - 1) ** 0.5
     # reweighting steps to the sparsest coefficients, and weight of the frames' coefficients, which
     # are not part of a sentence and so need not be sparse
     sparse_steps: int = 20
@@ -258,7 +260,9 @@ def _conventions(s: Situation) -> Iterator[NamedChanges]:
 def _difference(s: Situation, coefficients: Array) -> str:
     """Axes along which both ends shift, and the difference that is identifiable instead."""
     numbers = np.abs(coefficients).max(axis=0).reshape(3, -1).max(axis=1)
-    axes = [c for c, x in zip(AXIS_LETTERS, numbers, strict=True) if x > 0.05 * numbers.max()]
+    axes = [
+        c for c, x in zip(AXIS_LETTERS, numbers, strict=True) if x > NAMED_SHARE * numbers.max()
+    ]
     layout = s.machine.layout
     base, platform = (
         joined(list(dict.fromkeys(f"the {g.carrier.called}" for g in groups_)))
@@ -341,7 +345,7 @@ def _sliding(_s: Situation, coefficients: Array) -> str:
         if base > platform:
             return "can grow while its base joint moves back along it"
         return "can grow while its platform joint moves on along it"
-    if abs(coefficients[0].sum()) < 0.05 * max(base, platform):
+    if abs(coefficients[0].sum()) < SMALL_PART * max(base, platform):
         return "can shift along itself with both joints"
     return "can grow while both of its joints move along it"
 
@@ -634,10 +638,10 @@ def _line(
     square = float(omega @ omega)
     point, direction = middle + cross(omega, tau) / square, omega / np.sqrt(square)
     axis = _axis_name(direction)
-    if abs(float(omega @ tau) / square) > THROUGH_AXIS_DISTANCE * spread:
+    if abs(float(omega @ tau) / square) > SMALL_PART * spread:
         return f"{axis or 'an axis'} and shift along it at once"
     distance = np.linalg.norm(np.cross(points - point, direction), axis=-1)
-    on = [j for j in np.flatnonzero(distance < THROUGH_AXIS_DISTANCE * spread) if j not in legs]
+    on = [j for j in np.flatnonzero(distance < SMALL_PART * spread) if j not in legs]
     if len(on) >= 2:
         return f"the axis through joints {joined([str(j + 1) for j in on])}"
     if len(on) == 1:

@@ -33,7 +33,8 @@ TURNING_BY_FREEDOMS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}
 """Hypothesis by the number of rotations in a machine's motion."""
 LEAST_PAIR_TURN = np.radians(10.0)
 """Rotations (rad) between two poses below which their axis is ignored: its noise grows as 1 /
-rotation."""
+rotation. It affects the spread that is reported, not the test. Not checked within a factor of
+two."""
 ROTATION_AXIS_STEPS = 10
 MOST_TURN_PAIRS = 200_000
 

@@ -40,7 +40,8 @@ class PoseSamplingOptions:
     # platform plus the platform's radius
     shift: float = 0.12
     # smallest distance of a sample from singular poses, relative to the median over the session:
-    # near a singular pose any error is amplified, and no machine works there
+    # near a singular pose any error is amplified, and no machine works there. It affects the stated
+    # tool errors only; not checked within a factor of two
     regular: float = 0.7
 
 

@@ -24,6 +24,7 @@ from pkmcal.levels import (
     FEW,
     MAJORITY,
     NEGLIGIBLE,
+    RELEVANT_SHARE,
     ROUNDING,
     UNEXPLAINED_SCALE,
 )
@@ -39,7 +40,7 @@ from pkmcal.wording import amount, in_full, listed
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
 
-POLISHED_SHADING = 4 * OWN_SHADING
+POLISHED_SHADING = UNEXPLAINED_SCALE * OWN_SHADING
 """Shading of each edge in addition to its line, px, above which tubes look like polished metal, or
 are in hard light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted
 ones."""
@@ -51,25 +52,29 @@ class VerdictOptions:
 
     # noise scale above which the model does not explain the measurements
     too_noisy: float = UNEXPLAINED_SCALE
-    # share of rejected edges beyond which the remaining ones may be the outliers
+    # share of rejected edges beyond which the remaining ones may be the outliers: a tenth below the
+    # half at which a robust estimate breaks down. Not checked within a factor of two
     too_many_rejected: float = 0.4
     # limit of the undetermined part of the platform's error by the nominal model. A calibration
     # reduces that error by a factor of twenty to fifty; an undetermined twentieth would be the
-    # largest error of the result, and more images of the same kind do not reduce it
+    # largest error of the result, and more images of the same kind do not reduce it. With half or
+    # twice the limit, refusals with a part between these become warnings or the reverse; how many
+    # was not checked
     undetermined_share: float = 0.05
     # share of the platform's variance due to noise above which the undetermined part is accepted,
     # since it hardly increases the standard deviation
     least_noise_share: float = FEW
     # displacement by one undetermined motion, relative to the platform's standard deviation, that
-    # causes a warning: one half increases the standard deviation by an eighth
-    worth_reporting: float = 0.5
+    # causes a warning
+    worth_reporting: float = RELEVANT_SHARE
     # share of configurations near a singular pose above which the estimate is not reliable
     singular_share: float = MAJORITY
     # share of the undetermined displacement above which one motion is a reason of its own
     large_cause_share: float = CAUSE_SHARE
-    # limit of the result's standard deviation relative to that by the prior sigmas: below a half
-    # the result is almost surely better than the nominal model; above, new values are not worth
-    # their risk
+    # limit of the result's standard deviation relative to that by the prior sigmas. If the six
+    # numbers of a pose have independent normal errors, the result is nearer to the truth than the
+    # nominal model with a probability of 94 % at this limit, 99.8 % at half of it, and 50 % at
+    # twice (F distribution); new values are then not worth their risk
     nominal_error_share: float = 0.5
     # residual of a reading, in standard deviations, above which it contradicts the images, and the
     # share of such readings that is a reason
@@ -77,7 +82,7 @@ class VerdictOptions:
     contradicted_share: float = NEGLIGIBLE
     # number of a leg's edges, relative to the median of all legs, below which it is seldom in view
     few_edges_share: float = FEW
-    # number of configurations below which a note is added
+    # number of configurations below which a note is added; no other decision depends on it
     few_configurations: int = 10
     # number of heights of a bed with which a wrong height is detected before it moves the tool by
     # much more than its standard deviation (benchmarks/heights.py)

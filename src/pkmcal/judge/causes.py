@@ -26,7 +26,8 @@ from pkmcal.wording import split_name
 JointSide = Literal["base", "platform"]
 JOINT_SIDES: tuple[JointSide, JointSide] = ("base", "platform")
 COMMON_MOUNT_RATIO = 0.7
-"""Maximum distance of two joints on a common mount, relative to the distance of the next joint."""
+"""Maximum distance of two joints on a common mount, relative to the distance of the next joint: in
+a regular hexagon of joints the ratio is 1. Not checked within a factor of two."""
 
 
 @dataclass(frozen=True)

@@ -30,17 +30,13 @@ from pkmcal.judge.causes import (
     zeros,
 )
 from pkmcal.judge.fixed_machine import Evidence
-from pkmcal.levels import NEGLIGIBLE
+from pkmcal.levels import MAJORITY, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.hypotheses import OPTIONS
 from pkmcal.ranges import default
 
 CHANGE_ALPHA: float = default("watch", "alpha")
 """False-alarm rate: share of unchanged machines that are reported as changed."""
-LEAST_OBSERVABLE_DEVIATIONS = 1.0
-"""Minimum effect, in standard deviations, of a change by one prior sigma, for its direction to be
-tested; less observable directions would only add noise to the test.
-"""
 DETECTION_POWER = 0.9
 """Probability with which a detectable change is detected."""
 WATCH_NOISE_DRAWS = 20_000
@@ -81,7 +77,8 @@ def observable_directions(evidence: Evidence, cause: Cause) -> ObservableCause:
     """Observable directions in w of a cause."""
     scaled = evidence.along(cause.columns * cause.sizes)
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
-    observable = s > LEAST_OBSERVABLE_DEVIATIONS
+    # data of which most of the information, s^2 / (1 + s^2), is not the prior's
+    observable = s**2 > MAJORITY * (1 + s**2)
     return ObservableCause(u[:, observable], s[observable, None] * vt[observable] / cause.sizes)
 
 

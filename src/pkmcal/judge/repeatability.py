@@ -22,7 +22,7 @@ from pkmcal.files import json_value
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, skew
 from pkmcal.identify.axis_measurements import AxisNoise
-from pkmcal.levels import ALIGNED_ANGLE, CAUSE_SHARE, NEARLY_ALL
+from pkmcal.levels import ALIGNED_ANGLE, CAUSE_SHARE, NEARLY_ALL, RELEVANT_SHARE
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages
@@ -41,9 +41,6 @@ from pkmcal.outcome.progress import Progress, no_progress
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.solver.ranks import nonzero
 
-MOSTLY_COMMON = 0.5
-"""Scatter, relative to the images' own estimate, below which averaging repeats gains less than
-an eighth."""
 REPEAT_SHUFFLES = 16
 """Number of permutations of the repeats, from which the share explained by chance is estimated
 to a few hundredths."""
@@ -545,7 +542,8 @@ def _mm(value: float) -> str:
 def repeat_findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
     """Findings about each station's repeats, and about the benefit of further ones."""
     results = [_finding(station) for station in stations] or [doubtful("repeats.none")]
-    if stations and all(station.promised < MOSTLY_COMMON for station in stations):
+    # averaging would reduce no standard deviation by a relevant factor
+    if stations and all(station.promised < RELEVANT_SHARE for station in stations):
         results.append(note("repeats.mostly_common"))
     return tuple(results)
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.camera_calibration.calibrate import CameraCalibration, coverage
+from pkmcal.camera_calibration.calibrate import (
+    CALIBRATION_CHECK_OPTIONS,
+    CameraCalibration,
+    coverage,
+)
 from pkmcal.outcome.blocks.base import configuration_key
 from pkmcal.outcome.blocks.plot import (
     BarsMark,
@@ -29,8 +33,6 @@ ANGLE_STEP = 5.0
 """Width of a bar in the histogram of angles from the axis, degrees."""
 COVERAGE_CELLS = (16, 12)
 """Columns and rows of cells in which corners are counted."""
-OUTLYING_VIEW_FACTOR = 2.0
-"""Held-out error, in that of the median view, from which on a view is emphasized."""
 
 
 def field_plots(c: CameraCalibration) -> tuple[Panels, ...]:
@@ -138,7 +140,7 @@ def views_plot(c: CameraCalibration) -> Plot | None:
             y=rounded(float(out)),
             tip=f"{name}: {brief(float(out))} px held out, {brief(float(own))} px when fitted",
             key=configuration_key(name),
-            colour="quiet" if out < OUTLYING_VIEW_FACTOR * middle else None,
+            colour="quiet" if out < CALIBRATION_CHECK_OPTIONS.outlying_view * middle else None,
         )
         for name, out, own in zip(c.views, c.held_out.by_view, fitted, strict=True)
     ]

@@ -8,6 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.estimate import Estimate
+from pkmcal.levels import INSEPARABLE_CORRELATION
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.plot import (
     CellsMark,
@@ -26,8 +27,6 @@ MOST_CORRELATIONS = 250
 """Most parameters in the plot of correlations; with more a cell would be below three pixels."""
 LEAST_CORRELATION = 0.05
 """Correlation below which a cell is left empty: its colour would not be seen."""
-STRONG_CORRELATION = 0.8
-"""Correlation above which a pair is listed."""
 MOST_PAIRS = 24
 HOW_TOGETHER = (
     "Orange: when one is larger than stated, so is the other; blue: the other is smaller. Only"
@@ -46,10 +45,10 @@ def section(estimate: Estimate) -> Part | None:
     names = [table.in_words(table.names[k]) for k in free]
     off = np.abs(rho) * pairs
     a, b = np.unravel_index(np.argmax(off), off.shape)
-    strong = np.count_nonzero(off > STRONG_CORRELATION)
+    strong = np.count_nonzero(off > INSEPARABLE_CORRELATION)
     text = (
         f"Of {np.count_nonzero(pairs)} pairs, {strong} have a correlation of"
-        f" more than {STRONG_CORRELATION:g}; the closest are {names[a]} and {names[b]},"
+        f" more than {INSEPARABLE_CORRELATION:.2f}; the closest are {names[a]} and {names[b]},"
         f" {number(rho[a, b], 2, signed=True)}."
     )
     if np.count_nonzero(pairs) < len(free) * (len(free) - 1) // 2:

@@ -17,6 +17,7 @@ from pkmcal.arrays import Array, Booleans, Integers, enlargement
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.images import upright_turns
@@ -38,15 +39,11 @@ FIELD_EDGE_FRACTIONS = np.linspace(0.05, 0.95, 10)
 """Positions on an edge, as fractions of its span: an edge crosses several cells."""
 FIELD_CELLS_ACROSS = 14
 """Cells across the image."""
-FEWEST_IN_A_CELL = 5
-"""Fewest edges and corner coordinates in a cell that is shown."""
 LEAST_WEIGHT_ACROSS = np.sin(np.deg2rad(15.0)) ** 2
 """Least share of a cell's information in a direction in which the shift is shown.
 
 Edges within 15 degrees of one another have no more along themselves: noise, enlarged fourfold.
 """
-CELL_BY_CHANCE_SHARE = 0.01
-"""Share of cells that are significant by chance, if edges err independently."""
 FIELD_ARROW_LENGTH = 0.06
 """Length of a large mean shift as drawn, in image widths."""
 MEAN_IMAGE_WIDTH, MEAN_IMAGES = 640, 12
@@ -314,15 +311,14 @@ def _cells(
     rank = strong.sum(axis=1)
     freedom = np.maximum(n - rank, 1)
     residual = np.maximum(total(value**2) - explained, 1e-300)
-    # F-test of the shift against the scatter about it
-    significant = (
-        fdtrc(rank, freedom, explained / rank / (residual / freedom)) < CELL_BY_CHANCE_SHARE
-    )
+    # F-test of the shift against the scatter about it, of which a negligible share of the cells is
+    # significant by chance
+    significant = fdtrc(rank, freedom, explained / rank / (residual / freedom)) < NEGLIGIBLE
     places = (
         np.stack([cells % FIELD_CELLS_ACROSS, cells // FIELD_CELLS_ACROSS], axis=-1) + 0.5
     ) * side - 0.5
     out: list[blocks.Arrow] = []
-    for c in np.flatnonzero(n >= FEWEST_IN_A_CELL).tolist():
+    for c in np.flatnonzero(n > rank).tolist():
         here = first[number_of == c]
         (x, y), (right, down) = places[c].tolist(), shift[c].tolist()
         upright = (upright_turn(quarter_turns) @ shift[c]).tolist()

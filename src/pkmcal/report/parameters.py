@@ -17,7 +17,7 @@ from pkmcal.identify.parameter_estimates import (
     parameter_estimates,
 )
 from pkmcal.identify.unidentified import Identification
-from pkmcal.levels import ROUNDING
+from pkmcal.levels import INSEPARABLE_CORRELATION, OUTLIER_SIGMAS, ROUNDING
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import leg_key
@@ -37,11 +37,6 @@ from pkmcal.wording import (
     split_name,
 )
 
-TIGHT_CORRELATION = 0.95
-"""Correlation of two parameters above which a sentence reports it.
-
-At this value their combination is known 3.2 times better than each alone.
-"""
 MOST_TIGHT_PAIRS = 6
 MOST_BY_NOMINAL = 12
 """Names in the sentence on parameters that the nominal model decides."""
@@ -54,8 +49,6 @@ PARAMETER_SOURCES = {
 """Mark in the table by the source's key."""
 HELD_SOURCES = ("frame", "fixed")
 HELD_TAG, SIGNIFICANT_TAG = "held", "significant"
-SIGNIFICANT_SIGMAS = 3.0
-"""Change in standard deviations from which on a filter of the table keeps a parameter."""
 PARAMETER_KIND_NAMES = {
     "center": "centres",
     "offset": "offsets",
@@ -152,7 +145,7 @@ def parameter_table(estimates: ParameterEstimates, gauge: str) -> DataTable:
             Filter(tag=kind, label=PARAMETER_KIND_NAMES.get(kind, kind), group="kind")
             for kind in kinds
         ),
-        Filter(tag=SIGNIFICANT_TAG, label=f"|change| > {SIGNIFICANT_SIGMAS:g} σ"),
+        Filter(tag=SIGNIFICANT_TAG, label=f"|change| > {OUTLIER_SIGMAS:g} σ"),
     ]
     if any(row.source in HELD_SOURCES for row in rows):
         filters.append(Filter(tag=HELD_TAG, label="also frame and fixed values", hides=True))
@@ -190,7 +183,7 @@ def _table_row(row: ParameterRow, kind: str) -> TableRow:
     """Row of the table; kind : of the parameter."""
     change, sigma = row.numbers[2:]
     in_sigmas = change / sigma if sigma else None
-    significant = in_sigmas is not None and abs(in_sigmas) > SIGNIFICANT_SIGMAS
+    significant = in_sigmas is not None and abs(in_sigmas) > OUTLIER_SIGMAS
     held = row.source in HELD_SOURCES
     share = row.share if np.isfinite(row.share) else None
     return TableRow(
@@ -327,8 +320,8 @@ def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
 
 
 def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
-    """Pairs of parameters (i, j, correlation) above ``TIGHT_CORRELATION``, the tightest first."""
+    """Pairs of parameters (i, j, correlation) that are hardly distinguished, the tightest first."""
     free, rho, pairs = correlations(estimate)
-    i, j = np.nonzero(pairs & (np.abs(rho) > TIGHT_CORRELATION))
+    i, j = np.nonzero(pairs & (np.abs(rho) > INSEPARABLE_CORRELATION))
     order = np.argsort(-np.abs(rho[i, j]), kind="stable")
     return [(int(free[i[n]]), int(free[j[n]]), float(rho[i[n], j[n]])) for n in order]

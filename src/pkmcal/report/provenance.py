@@ -12,8 +12,10 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.results import base_camera_covariance, versions
 from pkmcal.geometry.rigid import inverse, pose_difference
+from pkmcal.identify.edge_noise import EDGE_NOISE
 from pkmcal.identify.estimate import Estimate, GroupStatistics
 from pkmcal.identify.unidentified import identified
+from pkmcal.levels import INSEPARABLE_CORRELATION
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.overlays import EDGE_SIDE_NAMES
@@ -38,8 +40,6 @@ SIGMA_MEANING_TEXT = (
     " its file does not describe, an uneven bed) what these data show. Measurements that the"
     " calibration has not used are the test for the rest."
 )
-NORMAL_FROM_FREEDOMS = 50
-"""Degrees of freedom above which a Student distribution is reported as normal."""
 MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
@@ -229,7 +229,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
                 f"{number(scale, 2)} times the stated noise, and {number(shading, 3)} px by shading"
                 + (
                     f"; tails as of {tails:g} degrees of freedom"
-                    if tails < NORMAL_FROM_FREEDOMS
+                    if tails < EDGE_NOISE.tails[-1]
                     else ""
                 ),
             )
@@ -304,7 +304,7 @@ def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estima
         if pairs
         else Paragraph(
             text="No two values have a correlation of more than"
-            f" {parameters.TIGHT_CORRELATION}, so the data distinguish all of them."
+            f" {INSEPARABLE_CORRELATION:.2f}, so the data distinguish all of them."
         )
     )
     text = () if lists else ("Nothing was rejected.",)

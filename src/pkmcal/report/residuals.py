@@ -10,7 +10,9 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
+from pkmcal.levels import NOISE_EXCESS, OUTLIER_SIGMAS
 from pkmcal.measurements import EdgeSet
+from pkmcal.measurements.edges import SHADING_SIGMA
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.overlays import EDGE_SIDE_NAMES
 from pkmcal.observe.predict import legs_in_camera
@@ -35,13 +37,6 @@ from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import count, joined, named, number
 
-GROUP_STANDS_OUT_FACTOR = 1.5
-"""Ratio of a group's residuals to the median group's above which a sentence reports it."""
-SHADED_MEAN_SHIFT = 0.05
-"""Mean outward shift, px, above which a sentence reports it.
-
-Shading moves edges by this and more.
-"""
 SIGMAS_IN_WORDS = "standard deviations"
 HISTOGRAM_HALF_SPAN = 5.0
 """Standard deviations that the histogram spans on either side."""
@@ -355,7 +350,7 @@ def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[
     if len(level) < 3:
         return []
     middle = float(np.median(list(level.values())))
-    outstanding = [g for g, value in level.items() if value > GROUP_STANDS_OUT_FACTOR * middle]
+    outstanding = [g for g, value in level.items() if value > NOISE_EXCESS * middle]
     outstanding = sorted(outstanding, key=lambda g: -level[g])[:4]
     return [
         f"The residuals of {names[g]} are {number(level[g] / middle, 1)} times those of the "
@@ -374,7 +369,7 @@ def _shaded(edges: EdgeSet, estimate: Estimate, shifts: Array) -> list[str]:
         if len(finite_shifts) < 4:
             continue
         mean, error = finite_shifts.mean(), finite_shifts.std(ddof=1) / np.sqrt(len(finite_shifts))
-        if abs(mean) > max(SHADED_MEAN_SHIFT, 3 * error):
+        if abs(mean) > OUTLIER_SIGMAS * np.hypot(SHADING_SIGMA, error):
             where = f"leg {leg + 1} tube {tube + 1} {EDGE_SIDE_NAMES[side]}"
             shaded.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
     return [text for _, text in sorted(shaded, reverse=True)[:4]]

@@ -11,6 +11,7 @@ from pkmcal.judge.changes import DETECTION_POWER, LegTest
 from pkmcal.judge.sentences import cause_words, least_size, signed
 from pkmcal.judge.watch import Watch, names_of
 from pkmcal.judge.watch_runs import Run, continued, share
+from pkmcal.levels import NOISE_EXCESS
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
 from pkmcal.outcome.blocks.base import configuration_key, leg_key
 from pkmcal.outcome.blocks.plot import (
@@ -41,8 +42,6 @@ STAMPS = {
 """Result of a test in one to three words."""
 LEAST_DRAWN_SHARE = 0.01
 """Statistic, in thresholds, below which it is drawn there on the logarithmic axis."""
-LARGE_RESIDUAL_SIGMAS = 2.0
-"""Standard deviations above which a configuration's residuals are emphasized."""
 WATCH_METHOD_TEXT = (
     "Nothing is calibrated anew. The machine is held as the calibration left it; every pose of the"
     " platform, and where cameras and boards stand, are found from the new data. What is left over"
@@ -492,7 +491,7 @@ def _by_configuration(w: Watch) -> Plot | None:
                     y=rounded(value),
                     tip=f"{name}: {number(value, 2)} standard deviations",
                     key=configuration_key(name),
-                    colour="quiet" if value < LARGE_RESIDUAL_SIGMAS else None,
+                    colour="quiet" if value < NOISE_EXCESS else None,
                 )
             )
     if not points:
@@ -505,14 +504,10 @@ def _by_configuration(w: Watch) -> Plot | None:
         " image or its readings are wrong.",
         alt=f"Residuals of {count(len(points), 'configuration')}",
         x=category_axis(names, "configurations"),
-        y=linear_axis(
-            "root mean square, standard deviations", (*values, LARGE_RESIDUAL_SIGMAS), zero=True
-        ),
+        y=linear_axis("root mean square, standard deviations", (*values, NOISE_EXCESS), zero=True),
         marks=(
             RuleMark(name="expected of noise alone", axis="y", at=1.0),
-            RuleMark(
-                name="emphasized from here", axis="y", at=LARGE_RESIDUAL_SIGMAS, colour="calibrated"
-            ),
+            RuleMark(name="emphasized from here", axis="y", at=NOISE_EXCESS, colour="calibrated"),
             LineMark(name="", colour="quiet", points=line_points(names, values)),
             DotsMark(name="residuals", colour="calibrated", points=tuple(points)),
         ),

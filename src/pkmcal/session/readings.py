@@ -13,6 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
+from pkmcal.levels import FALSE_ALARM
 from pkmcal.measurements import Column
 from pkmcal.mechanisms.reading_hypotheses import (
     READING_HYPOTHESIS_OPTIONS,
@@ -23,9 +24,6 @@ from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.hypotheses import EvidenceLevel, decide, posterior
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
-# Largest range of K repeated readings, in standard deviations: below 6 for any K under a million,
-# so a larger range is movement.
-_SAME_SIGMAS = 6.0
 _UNITS = {
     "m": ("millimetres", "metres", "Divide them by 1000", "mm"),
     "rad": ("degrees", "radians", "Multiply them by pi/180", "deg"),
@@ -206,9 +204,20 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
     ]
 
 
+def largest_range(count: int) -> float:
+    """Range of repeated readings of one column, in standard deviations, that noise exceeds with the
+    probability FALSE_ALARM at most.
+
+    By Bonferroni's inequality for all pairs of readings: 4.9 for 5, 5.9 for 20, 6.9 for 100.
+    """
+    from scipy.special import ndtri
+
+    return float(-np.sqrt(2) * ndtri(FALSE_ALARM / max(count * (count - 1), 2)))
+
+
 def unmoved_readings(joints: Array, noise: float) -> Booleans:
     """Whether each column of readings (K, m) varies by no more than its noise, (m,)."""
-    return np.ptp(joints, axis=0) <= _SAME_SIGMAS * noise
+    return np.ptp(joints, axis=0) <= largest_range(len(joints)) * noise
 
 
 def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> InputError | None:
@@ -324,16 +333,15 @@ def same_pose(joints: Array, noise: float) -> Integers:
     Rows of one pose share this index.
     """
     owner = np.full(len(joints), -1)
+    limit = largest_range(len(joints)) * noise
     # Sort by the joint with the largest range, so that each row is compared with few others.
     spread = joints[:, np.argmax(np.ptp(joints, axis=0))]
     order = np.argsort(spread, kind="stable")
-    far = np.searchsorted(
-        spread[order], spread + noise * np.array([[-1.0], [1.0]]) * (_SAME_SIGMAS + 1)
-    )
+    far = np.searchsorted(spread[order], spread + np.array([[-1.0], [1.0]]) * (limit + noise))
     for row in range(len(owner)):
         if owner[row] < 0:
             near = order[far[0, row] : far[1, row]]
-            same = (np.abs(joints[near] - joints[row]) <= _SAME_SIGMAS * noise).all(axis=1)
+            same = (np.abs(joints[near] - joints[row]) <= limit).all(axis=1)
             owner[near[same & (owner[near] < 0)]] = row
     return owner
 
@@ -362,7 +370,7 @@ def without_repeats(
         values=total / np.bincount(group)[:, None],
         lines=tuple(table.lines[row] for row in first),
     )
-    rows = {"number": len(group), "poses": len(first), "apart": _SAME_SIGMAS}
+    rows = {"number": len(group), "poses": len(first), "apart": largest_range(len(group))}
     return merged, [doubtful("readings.repeated_poses", table.label, **rows)]
 
 

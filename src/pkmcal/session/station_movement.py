@@ -12,7 +12,8 @@ from pkmcal.measurements import Column
 from pkmcal.wording import amount
 
 FEWEST_BESIDE_MOVEMENT = 3
-"""Configurations on either side of a movement: fewer are outliers."""
+"""Configurations on either side of a movement: fewer are outliers. Not checked with
+other numbers."""
 MOVEMENT_MOMENTS_TRIED = 12
 """Times at most, spread over a station's configurations, at which it may have moved."""
 

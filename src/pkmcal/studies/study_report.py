@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.levels import NEARLY_ALL
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.blocks.plot import (
     Colour,
@@ -53,8 +54,6 @@ LEAST_NUMBERS = 3
 """Smallest number of values that are plotted on a numerical axis and joined by lines."""
 LOG_AXIS_RATIO = 8.0
 """Ratio of the largest to the smallest value above which the axis is logarithmic."""
-MANY_FAILED = 0.1
-"""Share of failed runs above which a combination is reported."""
 STUDY_METHOD_TEXT = (
     "Each run draws a machine from the nominal model's tolerances, measures it with the noise"
     " that is stated, and calibrates it as pkmcal calibrate does: from the nominal model,"
@@ -79,7 +78,7 @@ PAPER_STUDY_METHOD_TEXT = (
 def outcome_of(study: SweepResult) -> Outcome:
     """Outcome of ``pkmcal study``."""
     gains, bad = study.gains, [c for c in study.found if c.honest is False]
-    failing = [cell for cell in study.found if cell.failed.value > MANY_FAILED]
+    failing = [cell for cell in study.found if cell.failed.value > 1 - NEARLY_ALL]
     paper = not hasattr(study.subject.design, "observe")
     runs = count(study.runs, "simulated calibration")
     cells = "" if len(study.found) == 1 else f" of each of {len(study.found)} combinations"

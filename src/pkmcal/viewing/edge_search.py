@@ -39,10 +39,8 @@ from pkmcal.web.session_document import EdgesAnswer, LegCount, ViewRequest
 from pkmcal.wording import capital, count, named, number
 
 MIDDLE_EDGE_SIGMAS = 2.0
-"""Largest median offset of a fitting machine, in standard deviations.
-
-Those of the nominal model and of the search count, added in squares.
-"""
+"""Largest median offset of a fitting machine, in standard deviations of the nominal model and of
+the search, added in squares: 95 % of normal offsets are smaller."""
 
 
 class _EdgeResult(NamedTuple):

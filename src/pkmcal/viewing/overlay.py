@@ -12,6 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
+from pkmcal.levels import OUTLIER_SIGMAS
 from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
     EdgeCurve,
@@ -38,10 +39,6 @@ from pkmcal.wording import number
 
 STATION_POSE_DECIMALS = 4
 """Decimals of a written position in m; nobody places a camera to a tenth of a millimetre."""
-
-
-PIN_SIGMAS = 3.0
-"""Standard deviations of a pinned joint's place beyond which a pose contradicts it."""
 
 
 def pane_of(content: SessionContent, request: ViewRequest) -> Pane:
@@ -133,7 +130,7 @@ def pin_offsets(content: SessionContent, request: ViewRequest, T_camera_base: Ar
     # pixels of the tolerance, across the line of sight
     shift = pane.machine.document.tolerance.center * np.eye(3)[0]
     sigma = np.hypot(*(pane.camera.project(points + shift) - visible).T)
-    allowed = PIN_SIGMAS * np.hypot(sigma, PINNED_JOINT_SIGMA)
+    allowed = OUTLIER_SIGMAS * np.hypot(sigma, PINNED_JOINT_SIGMA)
     offsets = np.hypot(*(visible - pixels).T) - allowed
     return np.nan_to_num(np.maximum(offsets, 0.0), nan=np.inf)
 

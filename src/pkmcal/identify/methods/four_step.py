@@ -72,7 +72,8 @@ from pkmcal.mechanisms import Machine
 
 FourStepForm = Literal["corrected", "printed"]
 VAGUE_CENTRE_SHARE = 0.1
-"""Standard deviation of a base centre, relative to the base's size, above which it is rejected."""
+"""Standard deviation of a base centre, relative to the base's size, above which it is rejected. Not
+checked within a factor of two."""
 
 
 @dataclass(frozen=True)

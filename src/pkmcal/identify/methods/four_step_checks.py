@@ -20,16 +20,13 @@ from pkmcal.identify.methods.four_step_platform import (
 from pkmcal.identify.methods.leg_axes import Axes, in_base
 from pkmcal.identify.methods.registration import fixes_pose, loose, parts_of
 from pkmcal.identify.nominal_joints import NominalJoints, nominal_joints
-from pkmcal.levels import CAUSE_SHARE
+from pkmcal.levels import CAUSE_SHARE, MAJORITY
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import named
 
 FREE_OFFSETS_SINGULAR_VALUE = 1e-3
 """Singular value of the distances' derivatives by the offsets, relative to at most 1 for an image,
-below which a combination of offsets is unidentifiable."""
-VAGUE_LENGTH_SHARE = 0.5
-"""Standard deviation of a combination of lengths, relative to a leg's length, above which it is
-unidentifiable."""
+below which a combination of offsets is unidentifiable. Not checked within a factor of two."""
 USE_JOINT_METHOD = "use the joint method (bundle)"
 
 
@@ -196,7 +193,7 @@ def lengths_are_fixed(
     sigma = np.sqrt(np.sum(value**2) / freedom / np.maximum(values, 1e-300))
     length = float(np.mean(legs.rod[legs.closing] + merged.readings[0][:, legs.closing]))
     free = (values < FREE_OFFSETS_SINGULAR_VALUE**2 * len(merged.configuration)) | (
-        sigma > VAGUE_LENGTH_SHARE * length
+        sigma > MAJORITY * length
     )
     if not free.any():
         return

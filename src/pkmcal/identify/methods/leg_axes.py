@@ -19,6 +19,7 @@ from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
+from pkmcal.solver.kernels import INLIER_WEIGHT
 
 ONE_DIRECTION = 1e-6
 """Ratio of eigenvalues below which a leg has a single direction, so that its centre is
@@ -204,7 +205,9 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
     )
     group, n = index * n_legs + edges.leg, len(photo) * n_legs
     # normal equations of each group, and the mean normals of both sides
-    weight = np.where(weights > 0.5, 1 / np.trace(edges.covariance, axis1=1, axis2=2), 0.0)
+    weight = np.where(
+        weights >= INLIER_WEIGHT, 1 / np.trace(edges.covariance, axis1=1, axis2=2), 0.0
+    )
     weighted = weight[:, None] * edges.normal
     information, right, sides = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((2, n, 3))
     np.add.at(information, group, weighted[:, :, None] * edges.normal[:, None])

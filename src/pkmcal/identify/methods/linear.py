@@ -19,6 +19,7 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE
 
 RegressionMethod = Literal[
     "plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"
@@ -30,7 +31,7 @@ RESIDUALS_SORTED_TOGETHER = 2**22
 """Number of residuals that are sorted together, 32 MB."""
 HUBER_TUNING, TUKEY_TUNING = 1.345, 4.685
 """Tuning constants with 95 % efficiency for normal residuals."""
-COUNTED_TUKEY_WEIGHT = 0.05
+COUNTED_TUKEY_WEIGHT = (1 - (FULL_WEIGHT_DISTANCE / TUKEY_TUNING) ** 2) ** 2
 """Tukey weight above which an edge is an inlier with full weight: a clean edge may have lost most
 of its weight."""
 POORLY_FIXED = 1e-7

@@ -210,7 +210,7 @@ def parts_of(
         mask = np.repeat(frame, 3)
         held = own @ np.linalg.lstsq(own[mask], flat[mask], rcond=LOOSE_ITEMS_EIGENVALUE)[0]
         rate = np.linalg.norm((flat - held).reshape(len(items), -1), axis=1)
-        stay.append(rate < 0.05 * rate.max())
+        stay.append(rate < NEGLIGIBLE * rate.max())
     first = next((s for s in stay if not s.all()), np.zeros(len(items), dtype=bool))
     # if one frame has nearly all items, the other frame need not see beyond it
     beyond = (s for s, frame in zip(stay, visible, strict=True) if (frame & ~first).any())
