@@ -344,6 +344,11 @@ def test_a_session_of_one_image_is_viewed_and_placed(session, truth):
     angle, distance = off(value["overlay"]["pose"], true)
     assert angle < 1.5
     assert distance < 25
+    # another leg taken for leg 1, and then beside the place: right, or not placed
+    for turn in (2 * np.pi / 3, 0.2):
+        mistaken = rough @ pose(rotation(turn * np.array([0.0, 0.0, 1.0])), np.zeros(3))
+        value = opened.ask("localize", pose=mistaken.tolist())
+        assert not value["localized"] or off(value["overlay"]["pose"], true)[0] < 1.5
     assert pkmcal.view(session).document["kind"] == "session"
 
 
@@ -375,10 +380,13 @@ def test_a_fit_moves_no_joint_away_from_where_it_was_placed(page, truth, away):
     assert (angle < 1e-9 and distance < 1e-9) == (away > 0)
 
 
-def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
+@pytest.mark.parametrize("number", [1, 4])
+def test_a_machine_that_is_not_there_stays_where_it_was_put(session, number):
     loaded = load_session(session)
     rng = np.random.default_rng(3)
-    for photo in loaded.stations[0].images:
+    for photo in loaded.stations[0].images[number:]:
+        photo.path.unlink()
+    for photo in loaded.stations[0].images[:number]:
         image = cv2.imread(str(photo.path), 0)
         noise = rng.normal(128, 40, (image.shape[0] // 8, image.shape[1] // 8))
         cv2.imwrite(str(photo.path), cv2.resize(noise, image.shape[::-1]).clip(0, 255).astype("u1"))
