@@ -148,6 +148,12 @@ class PoseHypotheses(NamedTuple):
         """Some of the hypotheses, in the same order."""
         return PoseHypotheses(self.T_camera_base[rows], self.log_likelihood_ratio[rows], self.unit)
 
+    def weighed(self, log_likelihood: Array) -> PoseHypotheses:
+        """The hypotheses with independent evidence (H,), nats, best first."""
+        total = self.log_likelihood_ratio + self.unit * log_likelihood
+        order = np.argsort(-total, kind="stable")
+        return PoseHypotheses(self.T_camera_base[order], total[order], self.unit)
+
     @property
     def rival_probability(self) -> float:
         """Probability that the second hypothesis is the correct one, given that one of the first
