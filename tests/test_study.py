@@ -28,7 +28,7 @@ from pkmcal.studies.calibrations import (
 )
 from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
-from pkmcal.studies.findings import SweepResult, clustered
+from pkmcal.studies.findings import SweepResult, clustered, with_error
 from pkmcal.studies.statistics import Summary, covered
 from pkmcal.studies.study_report import study_document
 from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
@@ -377,6 +377,14 @@ def test_what_chance_does_is_no_gain():
         subject = study_subject()
         calls += SweepResult(subject, {"legs": (3, 4, 5)}, (), (), cells, 20, 0).gains[0].sure
     assert calls <= 0.05 * 400
+
+
+def test_a_standard_error_of_few_batches_is_not_printed():
+    """Student's distribution has a standard deviation from three degrees of freedom on."""
+    cell = study("a", (), runs=2).found[0]
+    for freedom, printed in ((1, False), (2, False), (3, True)):
+        few = replace(cell, freedom=freedom)
+        assert ("±" in with_error(few.with_usable_error(Summary(1.0, 0.1)))) == printed
 
 
 # the command

@@ -44,7 +44,7 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
 from pkmcal.viewing.content import SessionContent
 from pkmcal.viewing.pose_file import PoseFile
-from pkmcal.viewing.server import session_routes
+from pkmcal.viewing.server import session_document, session_routes
 from pkmcal.viewing.sources import MOST_ENTRIES
 from pkmcal.web import serving
 from pkmcal.web.bundle_files import SCRIPT_FILE, bundle_file
@@ -59,7 +59,7 @@ class Page(ServedPage):
 
     def __init__(self, folder, calibration=None, fewest=2):
         self.subject = SessionContent(load_session(folder, fewest=fewest), calibration)
-        routes = session_routes(self.subject)
+        routes = session_routes(self.subject, lambda: session_document(self.subject))
         self.app = serving.application(routes, TOKEN, PORT)
 
     def post(self, what, content=None, **body):
@@ -344,6 +344,11 @@ def test_a_session_of_one_image_is_viewed_and_placed(session, truth):
     angle, distance = off(value["overlay"]["pose"], true)
     assert angle < 1.5
     assert distance < 25
+    # another leg taken for leg 1, and then beside the place: right, or not placed
+    for turn in (2 * np.pi / 3, 0.2):
+        mistaken = rough @ pose(rotation(turn * np.array([0.0, 0.0, 1.0])), np.zeros(3))
+        value = opened.ask("localize", pose=mistaken.tolist())
+        assert not value["localized"] or off(value["overlay"]["pose"], true)[0] < 1.5
     assert pkmcal.view(session).document["kind"] == "session"
 
 
@@ -375,10 +380,13 @@ def test_a_fit_moves_no_joint_away_from_where_it_was_placed(page, truth, away):
     assert (angle < 1e-9 and distance < 1e-9) == (away > 0)
 
 
-def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
+@pytest.mark.parametrize("number", [1, 4])
+def test_a_machine_that_is_not_there_stays_where_it_was_put(session, number):
     loaded = load_session(session)
     rng = np.random.default_rng(3)
-    for photo in loaded.stations[0].images:
+    for photo in loaded.stations[0].images[number:]:
+        photo.path.unlink()
+    for photo in loaded.stations[0].images[:number]:
         image = cv2.imread(str(photo.path), 0)
         noise = rng.normal(128, 40, (image.shape[0] // 8, image.shape[1] // 8))
         cv2.imwrite(str(photo.path), cv2.resize(noise, image.shape[::-1]).clip(0, 255).astype("u1"))
@@ -405,13 +413,16 @@ def test_what_a_calibration_found_is_shown_with_its_judgement(page, demo):
     assert tip.endswith(f"weight {weight:.2f}")
 
 
-def test_reasons_of_what_was_left_out_are_reported(page, monkeypatch):
-    saved = page.subject.saved
+def test_reasons_of_what_was_left_out_are_reported(demo, tmp_path):
+    """Read anew where the file changes under an open page."""
+    own = shutil.copytree(demo.calibration, tmp_path / "calibration")
+    opened = Page(demo.session, own)
+    saved = opened.subject.saved
     name, configuration = saved.stations[0].name, saved.configurations[0]
     group = {"reason": "a cable hangs there", "cases": [[name, configuration, 3, 1, 2]]}
-    document = {**saved.document, "rejected": [group]}
-    monkeypatch.setitem(page.subject.__dict__, "saved", replace(saved, document=document))
-    visible = page.ask("edges", machine="calibration")
+    text = json.dumps({**saved.document, "rejected": [group]})
+    (own / "calibration.json").write_text(text)
+    visible = opened.ask("edges", machine="calibration")
     rows = [
         e["tip"]
         for e in (*shapes(visible, "edges"), *shapes(visible, "rejected"))
@@ -443,13 +454,13 @@ def test_a_calibration_of_another_session_is_refused(page, demo, session):
     assert "there is no calibration of this session" in message
 
 
-def test_a_station_that_was_left_out_is_reported(page, monkeypatch):
-    saved = page.subject.saved
-    others = replace(saved, stations=saved.stations[1:])
-    monkeypatch.setitem(page.subject.__dict__, "saved", others)
-    message = page.post("overlay", machine="calibration").json()["message"]
-    assert "the calibration has no station station1" in message
-    assert page.ask("overlay", station=1, machine="calibration")["pose"]
+def test_a_station_that_was_left_out_is_reported(session, demo):
+    text = (session / "session.yaml").read_text()
+    (session / "session.yaml").write_text(text.replace("  station1:", "  another:"))
+    opened = Page(session, demo.calibration)
+    message = opened.post("overlay", machine="calibration").json()["message"]
+    assert "the calibration has no station another" in message
+    assert opened.ask("overlay", station=1, machine="calibration")["pose"]
 
 
 def test_cameras_are_those_that_the_calibration_left(demo, session, tmp_path):
@@ -724,10 +735,15 @@ def test_what_is_written_later_is_listed_at_the_next_request(tmp_path, demo):
     assert list(rows()) == ["a.html", "b.html", "c.html", "bench"]
     assert rows()["b.html"] == before["b.html"]
     assert opened.document(rows()["a.html"]["href"])["title"] == "delta"
-    assert opened.document(rows()["bench"]["href"])["kind"] == "session"
+    bench = rows()["bench"]["href"]
+    assert opened.document(bench)["calibration"] == opened.document(bench)["report"] == ""
     assert rows()["bench"]["text"].endswith("; not calibrated")
+    # a session that is calibrated while its page is open
     shutil.copytree(demo.calibration, tmp_path / "bench" / "calibration")
     assert rows()["bench"]["text"].endswith("; calibrated")
+    assert opened.document(bench)["calibration"]
+    report = opened.document(bench)["report"]
+    assert opened.document(f"{bench}{report}")["kind"] == "report"
     # another page of the same name, and none at all
     shutil.copy(tmp_path / "a.html", tmp_path / "b.html")
     assert rows()["b.html"]["title"] == rows()["a.html"]["title"] != before["b.html"]["title"]

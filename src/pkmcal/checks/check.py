@@ -365,15 +365,7 @@ def _search_results(
     fixed = [p.station for p in images if not session.stations[p.station].handheld]
     localizations = located.leg_localization.localizations if located.leg_localization else ()
     places = dict(zip(fixed, localizations, strict=bool(localizations)))
-    # for a hand-held image, the probability of a rival pose takes the place of that of chance
-    for k, one in located.places.items():
-        places[k] = LocalizedPose(
-            one.T_camera_base[0],
-            math.nan,
-            float(one.log_likelihood_ratio[0]),
-            one.rival_probability,
-            has_prior=True,
-        )
+    places |= {k: LocalizedPose.of_image(one, True) for k, one in located.places.items()}
     return places
 
 

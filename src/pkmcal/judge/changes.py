@@ -304,8 +304,8 @@ class ChangeTests:
     alpha : family-wise false-alarm rate of all tests.
     level : level of a single test for that rate.
     rest : ``machine``, given the causes that were identified.
-    another_machine : whether a change of all parameters within their prior sigmas makes the data a
-        hundred times as likely as a few causes do; these are then not among the findings.
+    another_machine : whether a change of all parameters within their prior sigmas excludes an
+        explanation by a few causes (DISTINCT_LOG_ODDS); these are then not among the findings.
     """
 
     legs: tuple[LegTest, ...]

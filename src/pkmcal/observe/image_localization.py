@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.distance_tables import (
@@ -97,7 +97,7 @@ class ImageLocalizationOptions:
     # the radius of the base. No real parts are exactly interchangeable, but in an image they look
     # so
     joint_distance: float = 0.2
-    # rounds of the search near a pose, which ends with the first that gains nothing
+    # rounds of the search near a pose; refine_local ends with the first that gains nothing
     near_rounds: int = 3
     # starts in each round
     near_starts: int = 32
@@ -135,7 +135,7 @@ IMAGE_LOCALIZATION_OPTIONS = ImageLocalizationOptions()
 class PoseHypotheses(NamedTuple):
     """Candidate poses of an image, by decreasing log-likelihood ratio.
 
-    T_camera_base : (H, 4, 4), none near the first.
+    T_camera_base : (H, 4, 4), of distinct silhouettes.
     log_likelihood_ratio : (H,) against chance, as in :mod:`pkmcal.observe.pose_likelihood`.
     unit : log-likelihood ratio that counts as one independent measurement.
     """
@@ -143,6 +143,16 @@ class PoseHypotheses(NamedTuple):
     T_camera_base: Array
     log_likelihood_ratio: Array
     unit: float
+
+    def select(self, rows: Integers | Booleans) -> PoseHypotheses:
+        """Some of the hypotheses, in the same order."""
+        return PoseHypotheses(self.T_camera_base[rows], self.log_likelihood_ratio[rows], self.unit)
+
+    def weighed(self, log_likelihood: Array) -> PoseHypotheses:
+        """The hypotheses with independent evidence (H,), nats, best first."""
+        total = self.log_likelihood_ratio + self.unit * log_likelihood
+        order = np.argsort(-total, kind="stable")
+        return PoseHypotheses(self.T_camera_base[order], total[order], self.unit)
 
     @property
     def rival_probability(self) -> float:
@@ -162,7 +172,7 @@ def localize_image(
     image: Integers,
     options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
 ) -> PoseHypotheses:
-    """Pose hypotheses of the camera of one image, best first.
+    """Pose hypotheses of the camera of one image, best first, none near the first.
 
     view : of this image alone.
     """
@@ -181,12 +191,13 @@ def localize_image(
     hypotheses = _most(fine, hypotheses, 8, options.on_finer)
     hypotheses = hypotheses[distinct_silhouettes(fine, hypotheses, one)][: options.on_finest]
     # and, with the symmetric poses of the best two, at four times
-    return weighed_poses(
+    weighed = weighed_poses(
         view,
         image,
         np.concatenate([hypotheses, symmetric_poses(view, hypotheses[:2], options)]),
         options=options,
     )
+    return weighed.select(distinct(view, weighed.T_camera_base))
 
 
 def weighed_poses(
@@ -195,7 +206,7 @@ def weighed_poses(
     values: Array,
     options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
 ) -> PoseHypotheses:
-    """Hypotheses from poses (H, 4, 4) refined on the finest tables, duplicates removed.
+    """Hypotheses from poses (H, 4, 4) refined on the finest tables, equal silhouettes removed.
 
     Poses no likelier than chance are removed too, unless none remains; then the best one is
     returned.
@@ -208,7 +219,7 @@ def weighed_poses(
     order = order[log_likelihood_ratio[order] > 0]
     if not len(order):
         order = np.array([int(np.argmax(log_likelihood_ratio))])
-    order = order[distinct(view, values[order])]
+    order = order[distinct_silhouettes(view, values[order], one)]
     # unit of log likelihood: the mean length of half a leg's silhouette
     edges = edge_points(
         view.machine,
@@ -224,7 +235,9 @@ def weighed_poses(
 
 
 def distinct(view: StationView, values: Array) -> Integers:
-    """Indices of the poses (H, 4, 4), best first, that are not the same as a better one."""
+    """Indices of the poses (H, 4, 4), best first, that are not the same as a better one, nor near
+    the first.
+    """
     rows = np.array(distinct_silhouettes(view, values, np.zeros(1, dtype=int)))
     # poses near the first are the same pose, refined less well
     return rows[~same_pose(values[rows], values[0]) | (rows == 0)]
@@ -304,16 +317,37 @@ def localize_near(
     image: Integers,
     T_camera_base: Array,
     options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+    seed: int = 0,
 ) -> PoseHypotheses:
-    """Pose hypotheses of the camera of one image near a pose (4, 4) by hand, best first.
+    """Pose hypotheses of the camera of one image near a pose (4, 4), best first.
 
-    view : of this image alone.
+    view : of this image alone. seed : of the poses around it at which the search begins.
     """
     one = np.zeros(1, dtype=int)
     coarse = replace(view, tables=distance_tables([image], options.tables_at(1)))
-    starts = _starts_near(view, T_camera_base, np.random.default_rng(0), options)
+    starts = _starts_near(view, T_camera_base, np.random.default_rng(seed), options)
     settled = refine_lm(coarse, starts, one, 4, options.next_reaches)
     return weighed_poses(view, image, np.concatenate([starts, settled]), options)
+
+
+def with_neighbours(
+    view: StationView,
+    image: Integers,
+    T_camera_base: Array,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> PoseHypotheses:
+    """Pose hypotheses of the camera of one image from poses (H, 4, 4), best first, with the rivals
+    beside the best one, by several searches near it.
+
+    Without these searches, a local maximum of the likelihood beside the correct pose would have no
+    rival.
+    """
+    hypotheses = weighed_poses(view, image, T_camera_base, options)
+    for seed in range(1, options.near_rounds + 1):
+        near = localize_near(view, image, hypotheses.T_camera_base[0], options, seed)
+        poses = np.concatenate([hypotheses.T_camera_base, near.T_camera_base])
+        hypotheses = weighed_poses(view, image, poses, options)
+    return hypotheses
 
 
 def _starts_near(

@@ -22,6 +22,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import angle_between, inverse, pose, rotation
+from pkmcal.observe.image_localization import PoseHypotheses
 from pkmcal.observe.pose_candidates import CANDIDATE_OPTIONS, CandidateOptions, global_candidates
 from pkmcal.observe.pose_likelihood import (
     StationView,
@@ -192,6 +193,20 @@ class LocalizedPose:
     has_prior: bool = False
     correlation_length: float = 1.0
     options: LocalizationOptions = LOCALIZATION_OPTIONS
+
+    @classmethod
+    def of_image(cls, hypotheses: PoseHypotheses, has_prior: bool) -> LocalizedPose:
+        """Likeliest pose of a single image, in which rivals take the place of chance matches: there
+        are no other images to test it on.
+        """
+        return cls(
+            hypotheses.T_camera_base[0],
+            math.nan,
+            float(hypotheses.log_likelihood_ratio[0]),
+            hypotheses.rival_probability,
+            has_prior=has_prior,
+            correlation_length=hypotheses.unit,
+        )
 
     def likelier(self, other: LocalizedPose) -> float:
         """Log odds of this explanation of the images against another one of the same images."""

@@ -19,6 +19,8 @@ from pkmcal.wording import Chance, brief, decimals, number
 
 DIFFERENCE_ARROW_LENGTH = 0.05
 """Length of a large difference's arrow, in image widths."""
+SCALE_STRIP_HEIGHT = 0.1
+"""Height of the strip below the arrows in which their scale stands, in image widths."""
 ARROW_EVERY = 2
 """Cells of the maps from arrow to arrow."""
 ROTATION_TEXT = (
@@ -145,6 +147,9 @@ def _maps(d: CameraDifference) -> tuple[Block, ...]:
     lengths = np.linalg.norm(off[np.isfinite(off).all(axis=-1)], axis=-1)
     factor = enlargement(lengths, DIFFERENCE_ARROW_LENGTH * size[0])
     cx, cy = d.a.camera.center.tolist()
-    field = ImageField("From A's pixel to B's", 0, tuple(size), (cx, cy), arrows)
+    # the arrows fill the image: the scale stands in a strip below it
+    width, height = size
+    strip = round(SCALE_STRIP_HEIGHT * width)
+    field = ImageField("From A's pixel to B's", 0, (width, height + strip), (cx, cy), arrows)
     image = field_image(field, factor, (), f"arrows × {factor:g}")
     return (*panels(*maps), Images(images=(image,), size="figure"))

@@ -367,7 +367,8 @@ def _findings_table(w: Watch) -> Table | None:
         ("Cause", "χ² explained", "numbers"),
         tuple(rows),
         "Causes are compared by how likely they make the data, changes of a tolerance's size being"
-        " usual; those that a hundred to one does not separate stand under the best with “or”.",
+        " usual; those that odds of a thousand to one do not separate stand under the best with"
+        " “or”.",
         brief=False,
     )
 

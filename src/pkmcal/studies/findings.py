@@ -24,7 +24,7 @@ from pkmcal.studies.sweep import (
     Value,
     in_words,
 )
-from pkmcal.wording import brief, count, number
+from pkmcal.wording import brief, count, decimals, number
 
 PROMISED_COVERAGE = 0.95
 COVERAGE_TOLERANCE = 0.02
@@ -33,6 +33,10 @@ calibration.
 """
 COVERAGE_INTERVALS = np.array([0.5, 0.68, 0.8, 0.9, 0.95, 0.99])
 """Nominal coverages for which the actual coverage is reported."""
+
+
+LEAST_FREEDOM = 3
+"""Degrees of freedom from which Student's distribution has a standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,15 @@ class CellFindings:
     by_parameter: Array
 
     __repr__ = short_repr
+
+    def with_usable_error(self, summary: Summary) -> Summary:
+        """Figure of this combination, whose standard error is NaN if it means nothing.
+
+        The deviation over its standard error has Student's distribution, which has no standard
+        deviation with fewer than three degrees of freedom.
+        """
+        error = summary.error if self.freedom >= LEAST_FREEDOM else np.nan
+        return Summary(summary.value, error)
 
     @property
     def honest(self) -> bool | None:
@@ -140,14 +153,12 @@ class SweepResult:
         """
         lines = [f"{self.subject.name}, {count(self.runs, 'calibration')} a combination"]
         for cell in self.found:
-            position, error, stated = (
-                1e3 * value for value in (*cell.position, cell.position_sigma)
-            )
+            error = with_error(cell.with_usable_error(cell.position).times(1e3))
             lines.append(
-                f"  {in_words(cell.values) or 'as it is'}: tool {brief(position)} ±"
-                f" {brief(error)} mm,"
-                f" stated {brief(stated)} mm, {number(100 * cell.covered.value, 1)} % of the 95 %"
-                f" intervals hold, {number(100 * cell.failed.value, 1)} % failed"
+                f"  {in_words(cell.values) or 'as it is'}: tool {error} mm,"
+                f" stated {brief(1e3 * cell.position_sigma)} mm,"
+                f" {number(100 * cell.covered.value, 1)} % of the 95 % intervals hold,"
+                f" {number(100 * cell.failed.value, 1)} % failed"
             )
         return "\n".join(lines)
 
@@ -234,6 +245,17 @@ def findings_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
         parameters=tuple(name for name, _ in result.setting.parameters),
         by_parameter=np.where(np.isfinite(s).any(axis=0), covered(e.T, s.T), np.nan),
     )
+
+
+def with_error(summary: Summary) -> str:
+    """Value, with its standard error if that is finite, in decimals that show at least one digit of
+    each.
+    """
+    value, error = summary
+    if not np.isfinite(error):
+        return brief(value)
+    places = max(decimals(value), decimals(error) - 1 if error > 0 else 0)
+    return f"{number(value, places)} ± {number(error, places)}"
 
 
 def clustered(values: Array, batch: Integers) -> Summary:

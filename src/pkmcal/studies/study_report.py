@@ -37,14 +37,16 @@ from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.findings import (
     COVERAGE_INTERVALS,
     COVERAGE_TOLERANCE,
+    LEAST_FREEDOM,
     PROMISED_COVERAGE,
     CellFindings,
     Gain,
     SweepResult,
+    with_error,
 )
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.sweep import SweptSetting, Value, in_words
-from pkmcal.wording import amount, brief, count, decimals, number
+from pkmcal.wording import amount, brief, count, number
 
 MOST_LINES = 8
 """Maximum number of curves in one plot; beyond it, one curve averages all combinations."""
@@ -191,6 +193,7 @@ def _key_figures(study: SweepResult) -> tuple[Figure, ...]:
     """Key figures of the best combination."""
     best = min(study.found, key=lambda cell: np.nan_to_num(cell.position.value, nan=np.inf))
     which = f"with {in_words(best.values)}" if len(study.found) > 1 else "root mean square"
+    error = best.with_usable_error(best.position).error
     errors = (
         (brief(1e3 * best.position.value), "mm"),
         (brief(np.rad2deg(best.orientation.value)), "°"),
@@ -204,7 +207,7 @@ def _key_figures(study: SweepResult) -> tuple[Figure, ...]:
         Figure(
             "How far off is the tool after a calibration?",
             errors[columns],
-            f"{which}; ± {brief(1e3 * best.position.error)} mm by chance",
+            f"{which}; ± {brief(1e3 * error)} mm by chance" if np.isfinite(error) else which,
         ),
         Figure(
             "What stays below in 95 % of the workspace?",
@@ -229,14 +232,12 @@ def _table(study: SweepResult) -> Table:
     rows, turns = list[Row](), _rotates(study)
     for cell in study.found:
         turn = (
-            _with_error(
-                float(np.rad2deg(cell.orientation.value)), float(np.rad2deg(cell.orientation.error))
-            ),
+            with_error(cell.with_usable_error(cell.orientation).times(np.rad2deg(1.0))),
             brief(np.rad2deg(cell.orientation_sigma)),
             brief(np.rad2deg(cell.orientation_95)),
         )
         cells = (
-            _with_error(1e3 * cell.position.value, 1e3 * cell.position.error),
+            with_error(cell.with_usable_error(cell.position).times(1e3)),
             brief(1e3 * cell.position_sigma),
             number(100 * cell.covered.value, 1),
             number(100 * cell.covered_tool.value, 1),
@@ -246,7 +247,10 @@ def _table(study: SweepResult) -> Table:
         )
         mark = Level.DOUBTFUL if cell.honest is False else None
         rows.append(Row(in_words(cell.values) or study.subject.name, cells, mark=mark))
-    error = "Root mean square error of the tool after a calibration, with its standard error."
+    error = (
+        "Root mean square error of the tool after a calibration, with its standard error if it has"
+        f" {LEAST_FREEDOM} degrees of freedom or more: those of the batches of runs."
+    )
     stated = "Standard deviation that the calibrations state."
     largest = "Error that is not exceeded in 95 % of all runs and poses."
     heads = {
@@ -263,14 +267,6 @@ def _table(study: SweepResult) -> Table:
         "Errors after a calibration", tuple(heads), tuple(rows), first=5,
         hints=tuple(heads.values()),
     )  # fmt: skip
-
-
-def _with_error(value: float, error: float) -> str:
-    """A number with its standard error, with the decimals that show at least one digit of each."""
-    if not np.isfinite(error):
-        return brief(value)
-    places = max(decimals(value), decimals(error) - 1 if error > 0 else 0)
-    return f"{number(value, places)} ± {number(error, places)}"
 
 
 def _coverage_part(study: SweepResult) -> Part:
@@ -355,7 +351,8 @@ def _curve(study: SweepResult, name: str, groups: list[tuple[str, list[CellFindi
     else:
         for k, (of, cells) in enumerate(groups):
             colour, stated = leg_colour(k + 1), [cell.position_sigma for cell in cells]
-            marks += _series(study, name, x, of, colour, [c.position for c in cells], stated)
+            errors = [cell.with_usable_error(cell.position) for cell in cells]
+            marks += _series(study, name, x, of, colour, errors, stated)
     points = [p for mark in marks if isinstance(mark, DotsMark) for p in mark.points]
     ends = [v for p in points for v in (p.y, p.high) if isinstance(v, float)]
     return Plot(
@@ -396,7 +393,7 @@ def _series(
                     y=rounded(1e3 * error.value),
                     low=rounded(1e3 * (error.value - reach)),
                     high=rounded(1e3 * (error.value + reach)),
-                    tip=f"{where}: {_with_error(1e3 * error.value, 1e3 * error.error)} mm",
+                    tip=f"{where}: {with_error(error.times(1e3))} mm",
                 )
             )
         if stated and np.isfinite(stated[k]):

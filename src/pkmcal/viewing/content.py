@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.file_names import CALIBRATION_DOCUMENT_FILE
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.cameras.files import written_camera
 from pkmcal.cameras.response import Response
@@ -22,6 +23,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.images import decode, upright_turns
 from pkmcal.session.image_files import Image, label_of
 from pkmcal.session.load import Session, Station
+from pkmcal.viewing.stored_pages import FileState, file_state
 
 if TYPE_CHECKING:
     from pkmcal.boards.board import Board, Detection
@@ -60,14 +62,15 @@ class Pane:
 
 
 class SessionContent:
-    """Session and, if there is one, its calibration.
+    """Session and, if there is one, its calibration, as its files are at each request.
 
-    calibration : folder that `pkmcal calibrate` wrote, None for none.
+    calibration : folder into which `pkmcal calibrate` writes, None for none.
     """
 
     def __init__(self, session: Session, calibration: Path | None) -> None:
         self.session = session
-        self.calibration = calibration
+        self._calibration = calibration
+        self._read_calibration = lru_cache(1)(self._read)
         self.image = lru_cache(DECODED_IMAGES_CACHED)(self._image)
         self.corners = lru_cache(DECODED_IMAGES_CACHED)(self._corners)
         self.start = cache(self._start)
@@ -170,15 +173,26 @@ class SessionContent:
         excess = saved.document["stations"][self.number(s)].get("focal_scale", 1.0) - 1.0
         return replace(camera, parameters=camera.parameters + excess * camera.focal_part)
 
-    @cached_property
+    @property
+    def calibration(self) -> Path | None:
+        """Folder of the calibration, None without one."""
+        folder = self._calibration
+        return folder if folder and (folder / CALIBRATION_DOCUMENT_FILE).is_file() else None
+
+    @property
     def saved(self) -> SavedCalibration:
         """Calibration. Raises InputError if there is none, or if it is of another session."""
+        folder = self._calibration
+        return self._read_calibration(folder and file_state(folder / CALIBRATION_DOCUMENT_FILE))
+
+    def _read(self, _state: FileState) -> SavedCalibration:
+        """Calibration in the present state of its file."""
         from pkmcal.calibration.saved_calibration import load
 
         if self.calibration is None:
             raise InputError(
                 "there is no calibration of this session",
-                where=str(self.session.folder),
+                where=str(self._calibration or self.session.folder),
                 next_step="Run pkmcal calibrate, or name its folder with --calibration",
             )
         saved = load(self.calibration)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import angle_between
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.image_localization import localize_image, localize_near, weighed_poses
+from pkmcal.observe.image_localization import localize_image, localize_near, with_neighbours
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, find_station
+from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, LocalizedPose, find_station
 from pkmcal.viewing.content import SessionContent
 from pkmcal.viewing.overlay import (
     overlay_after_gesture,
     pane_of,
-    pin_offsets,
+    pin_distances,
     placed_by_hand,
     pose_rows,
 )
@@ -29,8 +32,44 @@ A search uses eight and verifies with the others, in about a second; `calibrate`
 """
 FEWEST_FITTED_TOGETHER = 2
 """Fewest images of which some can verify the pose that the others give."""
+PIN_SIGMAS = 3.0
+"""Standard deviations of a pinned joint's place beyond which a pose contradicts it."""
 LEAST_CHANCE_DISPLAYED = 1e-9
 """Probability below which no digits are displayed."""
+
+
+class _Judgement(NamedTuple):
+    """Likeliest pose (4, 4), whether the machine is localized there, and the reason as text."""
+
+    T_camera_base: Array
+    localized: bool
+    text: str
+
+
+class _PlacedJoints(NamedTuple):
+    """Joints that a person placed, and the pose (4, 4) at which they are."""
+
+    content: SessionContent
+    request: ViewRequest
+    start: Array
+
+    def log_likelihood(self, T_camera_base: Array) -> float:
+        """Log-likelihood, nats, of the joints at a pose (4, 4)."""
+        distance, sigma = pin_distances(self.content, self.request, T_camera_base)
+        return -0.5 * float(np.sum((distance / sigma) ** 2))
+
+    def contradiction(self, T_camera_base: Array) -> float:
+        """Largest distance, px, by which a pose (4, 4) moves a joint farther than its error allows,
+        beyond the same at the start; 0 for none.
+        """
+        # a leg's silhouettes allow it to slide along itself; the joints placed by hand do not
+        off, at_start = (
+            np.maximum(distance - PIN_SIGMAS * sigma, 0.0)
+            for distance, sigma in (
+                pin_distances(self.content, self.request, T) for T in (T_camera_base, self.start)
+            )
+        )
+        return float(off[off > at_start].max(initial=0.0))
 
 
 def localized_overlay(content: SessionContent, request: ViewRequest) -> LocalizationAnswer:
@@ -52,38 +91,29 @@ def localized_overlay(content: SessionContent, request: ViewRequest) -> Localiza
         start, pane_of(content, request).T_camera_base
     )
     near = None if request.anywhere or unplaced else start
+    joints = _PlacedJoints(content, request, start)
     # several images verify each other
     view = _search_view(content, request.station)
-    many = len(view.configuration) >= FEWEST_FITTED_TOGETHER
-    if many:
-        localized, sure, text = _from_images(view, None if request.anywhere else start)
+    if len(view.configuration) >= FEWEST_FITTED_TOGETHER:
+        judgement = _from_images(view, None if request.anywhere else start, joints)
     else:
         image = content.image(request.station, request.image)
-        localized, sure, text = _from_one_image(view, image, near)
-    if sure and request.pins:
-        # a leg's silhouettes allow it to slide along itself; the joints that a person placed do not
-        off = pin_offsets(content, request, localized)
-        off = off[off > pin_offsets(content, request, start)]
-        if off.size:
-            sure, text = (
-                False,
-                (
-                    f"Not placed: the best fit moves a joint that you placed by {off.max():.0f} px"
-                    " more than your hand and the nominal model allow, so your place is retained."
-                ),
-            )
-    pose = localized if sure else start
+        judgement = _from_one_image(view, image, near, joints)
+    pose = judgement.T_camera_base if judgement.localized else start
     # overlay at the localized pose, without the gesture and pins that led to the start
     plain = {"pose": pose_rows(pose), "gesture": None, "pins": ()}
     overlay = overlay_after_gesture(content, request.model_copy(update=plain))
-    return LocalizationAnswer(localized=sure, text=text, overlay=overlay)
+    return LocalizationAnswer(localized=judgement.localized, text=judgement.text, overlay=overlay)
 
 
-def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, str]:
-    """Localization from several images: pose, success, and a sentence."""
+def _from_images(view: StationView, start: Array | None, joints: _PlacedJoints) -> _Judgement:
+    """Localization from several images, near a start or everywhere."""
     pose = find_station(view, start, np.random.default_rng(0))
     shots = count(len(view.configuration), "image")
-    if pose.good:
+    moved = joints.contradiction(pose.T_camera_base)
+    if pose.good and moved:
+        text = _contradicted(moved)
+    elif pose.good:
         chance = (
             f"{pose.p_value:.0e}"
             if pose.p_value > LEAST_CHANCE_DISPLAYED
@@ -101,38 +131,54 @@ def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, s
             " and try again, or check whether nominal model, readings and images"
             " belong together."
         )
-    return pose.T_camera_base, pose.good, text
+    return _Judgement(pose.T_camera_base, pose.good and not moved, text)
 
 
 def _from_one_image(
-    view: StationView, image: Integers, start: Array | None
-) -> tuple[Array, bool, str]:
-    """Localization from one image, everywhere and near a start: pose, success, and a sentence."""
-    anywhere = localize_image(view, image)
-    if start is None:
-        near, best = anywhere, anywhere
-    else:
-        near = localize_near(view, image, start)
-        both = np.concatenate([near.T_camera_base, anywhere.T_camera_base])
-        best = weighed_poses(view, image, both)
-    if best.rival_probability < LOCALIZATION_OPTIONS.rival:
+    view: StationView,
+    image: Integers,
+    start: Array | None,
+    joints: _PlacedJoints,
+) -> _Judgement:
+    """Localization from one image, everywhere and near a start.
+
+    The start is no evidence: a person may take one leg of a machine of equal parts for another. The
+    joints that a person placed are.
+    """
+    poses = localize_image(view, image).T_camera_base
+    if start is not None:
+        poses = np.concatenate([localize_near(view, image, start).T_camera_base, poses])
+    hypotheses = with_neighbours(view, image, poses)
+    by_hand = np.array([joints.log_likelihood(T) for T in hypotheses.T_camera_base])
+    hypotheses = hypotheses.weighed(by_hand)
+    pose = LocalizedPose.of_image(hypotheses, has_prior=start is not None)
+    probability, rivals = brief(pose.p_value), hypotheses.T_camera_base[1:]
+    moved = joints.contradiction(pose.T_camera_base)
+    if pose.good and moved:
+        text = _contradicted(moved)
+    elif pose.good:
         text = "Placed: from no other place does the machine fit as well."
-        return best.T_camera_base[0], True, text
-    if start is not None and near.rival_probability < LOCALIZATION_OPTIONS.rival:
-        # one image has edges enough for a machine elsewhere; the person knows where it is
-        return (
-            near.T_camera_base[0],
-            True,
-            (
-                "Placed where it fits best near your place. One image does not exclude others: see"
-                " whether the lines lie on the legs."
-            ),
+    elif len(rivals):
+        turn = np.degrees(angle_between(rivals[0], pose.T_camera_base))
+        text = (
+            "Not placed: from several places the machine fits this image nearly as well. The second"
+            f" best, turned by {turn:.0f}° against the best, is the right one with probability"
+            f" {probability}. Bring joints of a leg whose number you know to their places: they"
+            " decide between these."
         )
-    why = f"with probability {brief(best.rival_probability)} another place is the right one"
+    else:
+        text = (
+            "Not placed: the best fit may be by chance, with probability"
+            f" {probability}. Bring it to where it is, joint by joint."
+        )
+    return _Judgement(pose.T_camera_base, pose.good and not moved, text)
+
+
+def _contradicted(moved: float) -> str:
+    """Sentence on a fit that moves a joint placed by hand by ``moved`` px."""
     return (
-        best.T_camera_base[0],
-        False,
-        f"Not sure: {why}. Bring it to where it is, joint by joint.",
+        f"Not placed: the best fit moves a joint that you placed by {brief(moved)} px"
+        " more than your hand and the nominal model allow, so your place is retained."
     )
 
 

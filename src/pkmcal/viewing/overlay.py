@@ -12,7 +12,6 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
-from pkmcal.levels import OUTLIER_SIGMAS
 from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
     EdgeCurve,
@@ -27,6 +26,7 @@ from pkmcal.outcome.blocks.machine import Property
 from pkmcal.viewing.content import Pane, SessionContent
 from pkmcal.viewing.gestures import (
     PINNED_JOINT_SIGMA,
+    UNSEEN_JOINT_PIXELS,
     aimed,
     farther,
     pinned,
@@ -119,9 +119,11 @@ def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     return StationPose.of(T_camera_base).rounded(STATION_POSE_DECIMALS)
 
 
-def pin_offsets(content: SessionContent, request: ViewRequest, T_camera_base: Array) -> Array:
-    """Distances (n,), px, of pinned joints at a pose (4, 4) from where they were placed, beyond
-    those that the nominal model's tolerance and a hand allow; infinite out of the image.
+def pin_distances(
+    content: SessionContent, request: ViewRequest, T_camera_base: Array
+) -> tuple[Array, Array]:
+    """Distances (n,), px, of pinned joints at a pose (4, 4) from where they were placed, and their
+    standard deviations (n,), px, by hand and by the nominal model's tolerance.
     """
     pane = pane_of(content, request)
     pins, pixels = _pins(content, request)
@@ -130,9 +132,8 @@ def pin_offsets(content: SessionContent, request: ViewRequest, T_camera_base: Ar
     # pixels of the tolerance, across the line of sight
     shift = pane.machine.document.tolerance.center * np.eye(3)[0]
     sigma = np.hypot(*(pane.camera.project(points + shift) - visible).T)
-    allowed = OUTLIER_SIGMAS * np.hypot(sigma, PINNED_JOINT_SIGMA)
-    offsets = np.hypot(*(visible - pixels).T) - allowed
-    return np.nan_to_num(np.maximum(offsets, 0.0), nan=np.inf)
+    distances = np.nan_to_num(np.hypot(*(visible - pixels).T), nan=UNSEEN_JOINT_PIXELS)
+    return distances, np.hypot(np.nan_to_num(sigma), PINNED_JOINT_SIGMA)
 
 
 def _pins(content: SessionContent, request: ViewRequest) -> tuple[Array, Array]:

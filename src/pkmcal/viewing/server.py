@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
@@ -24,10 +25,12 @@ if TYPE_CHECKING:
     from starlette.routing import BaseRoute
 
 
-def session_routes(content: SessionContent, report: str = "") -> list[BaseRoute]:
+def session_routes(
+    content: SessionContent, document: Callable[[], SessionDocument]
+) -> list[BaseRoute]:
     """Routes of a session's page: the page, images by GET, and requests by POST.
 
-    report : address of the calibration's report.
+    document : present document of the page.
     """
     from starlette.responses import Response
     from starlette.routing import Route
@@ -75,7 +78,7 @@ def session_routes(content: SessionContent, report: str = "") -> list[BaseRoute]
 
     answers = {"overlay": overlay, "edges": edges, "localize": localize, "save": save}
     return [
-        *serving.page_routes(lambda: session_document(content, report)),
+        *serving.page_routes(document),
         Route("/image/{s:int}/{k:int}", image),
         Route("/thumbnail/{s:int}/{k:int}", thumbnail),
         Route("/stage", stage_block),

@@ -39,6 +39,7 @@ from pkmcal.web.document import (
     FolderEntry,
     MachineDocument,
     PageDocument,
+    SessionDocument,
     Verdict,
 )
 from pkmcal.web.serving import page_routes
@@ -115,7 +116,7 @@ def _page_beside(path: Path) -> Path:
 
 
 def session_source(folder: Path, calibration: Path | None = None) -> Source:
-    """Session with a calibration, by default the one in its own folder."""
+    """Session with a calibration as it is at each request, by default in the session's folder."""
     session = load_session(folder, fewest=1)
     if not session.stations:
         raise InputError(
@@ -123,26 +124,22 @@ def session_source(folder: Path, calibration: Path | None = None) -> Source:
             where=f"{session.folder / SESSION_FILE_NAME}, stations",
             expected="a station with a camera",
         )
-    if calibration is None:
-        own = session.folder / CALIBRATION_FOLDER
-        has_own = (own / CALIBRATION_DOCUMENT_FILE).is_file()
-        content = SessionContent(session, own if has_own else None)
-    else:
-        content = SessionContent(session, calibration)
+    folder = calibration or session.folder / CALIBRATION_FOLDER
+    content, report = SessionContent(session, folder), folder / CALIBRATION_REPORT_FILE
+    if calibration is not None:
         _ = content.saved  # raises for an unusable file before the page is served
-    report = None if content.calibration is None else content.calibration / CALIBRATION_REPORT_FILE
-    has_report = report is not None and is_page(report)
+
+    def document() -> SessionDocument:
+        has_report = content.calibration is not None and is_page(report)
+        return session_document(content, "report/" if has_report else "")
 
     def routes() -> list[BaseRoute]:
         from starlette.routing import Mount
 
-        own_routes = session_routes(content, report_address)
-        if report is None or not has_report:
-            return own_routes
-        return [*own_routes, Mount("/report", app=OnDemand(lambda _: page_source(report)))]
+        report_page = Mount("/report", app=OnDemand(lambda _: page_source(report)))
+        return [*session_routes(content, document), report_page]
 
-    report_address = "report/" if has_report else ""
-    return Source(session_document(content, report_address), routes)
+    return Source(document(), routes)
 
 
 def page_source(path: Path) -> Source:
