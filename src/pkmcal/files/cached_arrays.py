@@ -66,7 +66,7 @@ def remembered_arrays(name: str) -> dict[str, Any] | None:
 def remember_arrays(
     name: str, arrays: Mapping[str, Any], most_bytes: int = MOST_CACHED_BYTES
 ) -> None:
-    """Cache arrays under a name; the oldest arrays are removed if the sum exceeds ``most_bytes``."""
+    """Cache arrays under a name; the oldest are removed if all of them exceed ``most_bytes``."""
     stream = BytesIO()
     np.savez_compressed(stream, **arrays)
     remember(name + _ENDING, stream.getvalue())
