@@ -734,7 +734,11 @@ def test_the_same_images_are_searched_once(searched):
     )
     assert session_name(session, stations, Boards(), unplaced) == path.stem
     noisier = replace(session, joint_noise=2 * session.joint_noise)
-    assert session_name(noisier, stations, Boards(), unplaced) != path.stem
+    warmer = replace(session, temperature=np.array([20.0, 21.0, 22.0]))
+    for other in (noisier, warmer):
+        assert session_name(other, stations, Boards(), unplaced) != path.stem
+    boards = Boards(tolerance=0.01)
+    assert session_name(session, stations, boards, unplaced) != path.stem
     # a file of something else under the right name
     np.savez(path, images=np.arange(3))
     assert remembered_session(path.stem, session.machine) is None

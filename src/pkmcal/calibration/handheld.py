@@ -110,7 +110,7 @@ _OPTIONS = HandheldOptions()
 class Localization:
     """Poses of all stations of a session, from their images; no error is raised.
 
-    recognition : of the machine in the images on tripods, None if none was searched.
+    leg_localization : of the images on tripods, None if none was searched.
     places : pose hypotheses of each hand-held image, by station number.
     result : the case without the rejected hand-held images, or the error if there is none.
     """

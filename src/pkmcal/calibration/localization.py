@@ -409,7 +409,7 @@ def frozen_in(session: Session) -> InputError | None:
 class StationSearch(NamedTuple):
     """Poses of all stations.
 
-    recognition : localization by the legs, None if no images were searched.
+    leg_localization : localization by the legs, None if no images were searched.
     T_camera_base : (S, 4, 4), NaN for hand-held images that are not localized yet.
     error : why another station has no pose, or the mistake that explains its images; poses are then
         incomplete.

@@ -133,7 +133,7 @@ def model_violations(
 
     A violation is named only if it explains more than the discrepancy does: those that are detected
     first are tested once more beside the discrepancy. The discrepancy in turn is estimated beside
-    the violations that are named, and beside no others.
+    those of the violations detected first that are named.
 
     tested : families of violations, :data:`TESTED` by default.
     """
@@ -222,7 +222,7 @@ def model_violations(
             tool,
             # a tube's value is that of its own lines
             []
-            if k in dict(tube_scores)
+            if first_tube <= k < len(listed)
             else [listed[n] for n in tests.rivals(k, [n for n, _ in value if n != k])],
         )
         for (k, score), fit in zip(value, fits, strict=True)

@@ -694,8 +694,9 @@ def _completed(
 ) -> legs.StationEdges:
     """Edges of a hand-held image, with coarse silhouettes in place of edges that were not measured.
 
-    The pose of such an image is determined by its own few edges, so none should be missing. scatter
-    : ratio of the standard deviation of the coarse edges to the stated one.
+    The pose of such an image is determined by its own few edges, so none should be missing.
+
+    scatter : ratio of the standard deviation of the coarse edges to the stated one.
     """
     state = estimate.state
     view = finest_view(estimate.machine, images, session.joints, state.T_base_platform, tables)
