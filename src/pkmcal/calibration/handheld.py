@@ -37,7 +37,12 @@ from pkmcal.calibration.localization_cache import (
     remembered_session,
     session_name,
 )
-from pkmcal.calibration.pose_scoring import ScoredPoses, register_images, rescore_poses
+from pkmcal.calibration.pose_scoring import (
+    PoseScoringOptions,
+    ScoredPoses,
+    register_images,
+    rescore_poses,
+)
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
 from pkmcal.identify.bundle import MarginalPrior
@@ -87,12 +92,12 @@ class HandheldOptions:
     most_rounds: int = 2
     # ratio by which the number of images that determine the machine must grow before the poses of
     # an image are scored anew
-    rescoring_growth: float = 1.25
+    rescoring_growth: float = PoseScoringOptions.refined_again_growth
     # factor on the number of hypotheses with which an ambiguous image is localized once more
     wider: int = 3
-    # distances from the camera of a neighbour that are tried for an image, relative to the
-    # neighbour's distance from the base: from a step to the opposite side; their ratio is that of
-    # the search of a single image
+    # distances from the camera of a neighbour that are tried for an image, relative to the median
+    # distance of the cameras from the base: from a step to the opposite side; their ratio is that
+    # of the search of a single image
     apart: Array = field(default_factory=lambda: np.geomspace(0.15, 2.5, 18))
     # largest rotation (rad) by which the joint estimate may change an image's localized pose
     most_turn: float = SAME_POSE_TURN / 2
