@@ -297,7 +297,7 @@ def imputation_variance(
     try:
         passes = _measurement_passes(session, predictions, turns.blur, turns.scatter, active, done)
     except (PkmcalError, np.linalg.LinAlgError) as error:
-        failures = [str(error)]
+        failures = [str(error)] * len(machines)
         machines, cameras, passes = machines[:0], cameras[:0], list[list[legs.StationEdges]]()
     # and the estimates from them
     for number, (drawn, own, one) in enumerate(zip(machines, cameras, passes, strict=True)):
