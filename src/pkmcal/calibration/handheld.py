@@ -246,8 +246,10 @@ def _searched(
             answers[k] = one
             progress(f"{text}: {done} of {len(some)}", done / len(some))
 
-    def believed() -> Array:
-        return _believed(hypotheses(), len(by_hand) + len(stated), boards, scene.T_camera_base)
+    def accepted_poses() -> Array:
+        return _accepted_poses(
+            hypotheses(), len(by_hand) + len(stated), boards, scene.T_camera_base
+        )
 
     with ThreadPoolExecutor(THREADS) as pool:
         # each image by itself
@@ -256,31 +258,38 @@ def _searched(
             answers[k] = _CachedHypotheses(one, one)
             done = len(answers)
             progress(
-                f"Localizing images by hand: {done} of {len(by_hand)}", 0.3 * done / len(by_hand)
+                f"Localizing hand-held images: {done} of {len(by_hand)}", 0.3 * done / len(by_hand)
             )
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = min((len(clearer) + 1) // 2, _OPTIONS.most_from_nominal)
         rescore(clearer[:half], "Scoring the least ambiguous images", part(progress, 0.3, 0.5))
-        so_far = _with_sure(session, at, room, so_far, believed(), boards)
+        so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
         text = f"Scoring the others, with {len(so_far.placed)} images localized"
         rescore(clearer[half:], text, part(progress, 0.55, 0.7))
         # join the images of a board, and score images without an accepted pose again
         for k, one in _on_board(hypotheses(), boards).items():
-            answers[k] = replace(answers[k], places=one)
-        so_far = _with_sure(session, at, room, so_far, believed(), boards)
+            if k in answers:  # poses that the session states remain
+                answers[k] = replace(answers[k], places=one)
+        so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
         rest = part(progress, 0.75, 1)
         for _ in range(_OPTIONS.most_rounds):
-            T = believed()
+            T = accepted_poses()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
             if not so_far.placed or not unsure:
                 break
             placed = len(by_hand) - len(unsure)
             text = f"Scoring again, with {placed} of {len(by_hand)} images localized"
             rescore(unsure, text, part(rest, 0, 0.4))
-            so_far = _with_sure(session, at, room, so_far, believed(), boards)
+            so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
             rest = part(rest, 0.5, 1)
-    out = _placed_at(so_far, believed(), (*by_hand, *stated))
+    # registered images at their estimated poses, without those in which too few legs are measured
+    out = accepted_poses()
+    for k in (*by_hand, *stated):
+        if k in so_far.scene.edges and not np.isnan(out[k]).any():
+            out[k] = so_far.scene.T_camera_base[k]
+        elif k in so_far.bare:
+            out[k] = np.nan
     untested = tuple(_untested(session, so_far, answers, out))
     return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
 
@@ -302,19 +311,6 @@ def _with_stated(
         stated[k] = PoseHypotheses(near.T_camera_base[:1], near.log_likelihood_ratio[:1], near.unit)
         T_camera_base[k] = near.T_camera_base[0]
     return stated, scene._replace(T_camera_base=T_camera_base)
-
-
-def _placed_at(so_far: _LocalizationState, believed: Array, by_hand: Sequence[int]) -> Array:
-    """T_camera_base (S, 4, 4) in the end: estimated for registered images, NaN for those that are
-    not accepted any more and where too few legs can be measured.
-    """
-    out = believed.copy()
-    for k in by_hand:
-        if k in so_far.scene.edges and not np.isnan(out[k]).any():
-            out[k] = so_far.scene.T_camera_base[k]
-        elif k in so_far.bare:
-            out[k] = np.nan
-    return out
 
 
 def _untested(
@@ -375,15 +371,15 @@ def _with_sure(
     images: Mapping[int, StationImages],
     room: Surroundings,
     so_far: _LocalizationState,
-    believed: Array,
+    T_camera_base: Array,
     boards: Boards,
 ) -> _LocalizationState:
     """State with all accepted images registered; unchanged without new ones.
 
-    believed : T_camera_base (S, 4, 4), NaN for images without an accepted pose.
+    T_camera_base : (S, 4, 4), NaN for images without an accepted pose.
     """
     scene = so_far.scene
-    sure = {k: T for k, T in enumerate(believed) if k in images and not np.isnan(T).any()}
+    sure = {k: T for k, T in enumerate(T_camera_base) if k in images and not np.isnan(T).any()}
     new = {k: T for k, T in sure.items() if k not in scene.edges}
     if not new:
         return so_far
@@ -565,7 +561,7 @@ def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
     ]
 
 
-def _believed(
+def _accepted_poses(
     hypotheses: Mapping[int, PoseHypotheses], count: int, boards: Boards, prior_poses: Array
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of the accepted images and those connected to them by a board.
