@@ -283,13 +283,7 @@ def _searched(
             rescore(unsure, text, part(rest, 0, 0.4))
             so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
             rest = part(rest, 0.5, 1)
-    # registered images at their estimated poses, without those in which too few legs are measured
-    out = accepted_poses()
-    for k in (*by_hand, *stated):
-        if k in so_far.scene.edges and not np.isnan(out[k]).any():
-            out[k] = so_far.scene.T_camera_base[k]
-        elif k in so_far.bare:
-            out[k] = np.nan
+    out = _final_poses(so_far, accepted_poses(), (*by_hand, *stated))
     untested = tuple(_untested(session, so_far, answers, out))
     return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
 
@@ -311,6 +305,22 @@ def _with_stated(
         stated[k] = PoseHypotheses(near.T_camera_base[:1], near.log_likelihood_ratio[:1], near.unit)
         T_camera_base[k] = near.T_camera_base[0]
     return stated, scene._replace(T_camera_base=T_camera_base)
+
+
+def _final_poses(so_far: _LocalizationState, T_camera_base: Array, by_hand: Sequence[int]) -> Array:
+    """Poses (S, 4, 4): estimated ones for registered images, NaN for images that are not accepted
+    any more and for those in which too few legs can be measured.
+
+    T_camera_base : (S, 4, 4) accepted poses, NaN for images without.
+    by_hand : station numbers of the hand-held images.
+    """
+    out = T_camera_base.copy()
+    for k in by_hand:
+        if k in so_far.scene.edges and not np.isnan(out[k]).any():
+            out[k] = so_far.scene.T_camera_base[k]
+        elif k in so_far.bare:
+            out[k] = np.nan
+    return out
 
 
 def _untested(
