@@ -68,8 +68,10 @@ class ImageLocalizationOptions:
     stride: int = 2
     # number of image positions retained for each camera position and rotation
     positions: int = 2
-    # number of hypotheses of the chart; in a cluttered laboratory the correct one is among the
-    # first thousand, with two of six legs hidden among the first eight thousand (measured)
+    # number of hypotheses of the chart that are compared by their silhouettes. Of 18 simulated
+    # images (gough-stewart and 3-rps, three seeds each) the same four are localized with it and
+    # with 16000, none at a wrong pose, and three of them with 4000 (measured); on a photograph with
+    # two of six legs hidden the correct one is among the first eight thousand
     charted: int = 8000
     # number of hypotheses that are refined
     refined: int = 2000
