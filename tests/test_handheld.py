@@ -746,16 +746,23 @@ def test_the_same_images_are_searched_once(searched):
 
 @pytest.mark.slow
 def test_new_data_of_a_calibrated_machine_use_the_same_poses(searched):
-    """Which `check` and `calibrate` cached, by the session's nominal model."""
+    """Which `check` and `calibrate` cached, by the session's nominal model; readings of the
+    calibration at the session's own poses are no rivals of these.
+    """
     session = searched[0]
     name = localized(searched, [1e-4, 1e-4, 1e-4])
     machine = session.machine.with_values(session.machine.values + 1e-6)
+    others = session.joints + 0.01
     saved = SimpleNamespace(
-        machine=machine, document={"stations": []}, joints=session.joints, used=np.zeros(3, bool)
+        machine=machine,
+        document={"stations": []},
+        joints=np.concatenate([others, session.joints]),
+        used=np.ones(6, dtype=bool),
     )
     value = measured_new_data(saved, session, 0, no_progress)
     assert value.session.machine is machine
     assert len(value.session.stations) == 3
+    np.testing.assert_array_equal(value.session.earlier_joints, others)
     # nothing was searched
     assert [path.stem for path in cache_folder().glob("*.npz")] == [name]
 

@@ -89,11 +89,14 @@ def measured_new_data(
     The session of the result lacks hand-held images that were not localized, and numbers its
     stations accordingly. seed : of the localization.
     """
+    # earlier readings are rivals of the session's own, so they must not be at the same poses
+    earlier = saved.joints[saved.used]
+    owner = same_pose(np.concatenate([session.joints, earlier]), session.joint_noise)
     new = replace(
         session,
         machine=saved.machine,
         stations=_as_calibrated(saved, session),
-        earlier_joints=saved.joints[saved.used],
+        earlier_joints=earlier[owner[len(session.joints) :] >= len(session.joints)],
     )
     # Stations on tripods are localized by the calibrated machine, because they may have few images.
     # Hand-held images are localized by the nominal model, as in `check` and `calibrate`: all
