@@ -25,6 +25,8 @@ from pkmcal.calibration.handheld import (
 )
 from pkmcal.calibration.localization import platform_poses, read_images
 from pkmcal.calibration.localization_cache import (
+    image_name,
+    remember_image,
     remember_session,
     remembered_session,
     session_name,
@@ -665,28 +667,41 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
     assert handheld._sure({}, 5) == []
 
 
-def stated(searched, number, rng):
-    """The session with a rough pose of each of the first ``number`` images."""
+def stated(searched, numbers=(0, 1, 2)):
+    """The session with rough poses of some images."""
     session, images, poses, truth = searched
-    rough = perturb(truth.T_camera_base, rng.normal(size=(len(images), 6)) * 0.03)
+    rough = perturb(truth.T_camera_base, 0.03 * np.random.default_rng(5).normal(size=(3, 6)))
     stations = [
-        replace(station, T_camera_base=rough[k]) if k < number else station
+        replace(station, T_camera_base=rough[k]) if k in numbers else station
         for k, station in enumerate(session.stations)
     ]
     return replace(session, stations=tuple(stations)), images, poses, truth
 
 
 def test_poses_by_hand_place_images(searched):
-    results = localize_case(stated(searched, 3, np.random.default_rng(5)))
+    results = localize_case(stated(searched))
     assert not results.session.rejected
     off = pose_difference(results.scene.T_camera_base, searched[3].T_camera_base)
     assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
 
 
+def test_a_pose_by_hand_joins_images_that_are_searched(searched):
+    """Whose poses by themselves are cached, and scored with all images."""
+    session, images, poses, truth = stated(searched, [1])
+    for k in (0, 2):
+        alone = PoseHypotheses(truth.T_camera_base[k : k + 1], np.array([20.0]), 1.0)
+        remember_image(image_name(session, session.machine, k), alone)
+    results = localize_case((session, images, poses, truth))
+    assert not results.session.rejected
+    off = pose_difference(results.scene.T_camera_base, truth.T_camera_base)
+    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
+
+
 def test_an_image_in_which_no_leg_can_be_measured_is_left_out(searched):
     """However well its silhouettes match, as of a shaken camera: it determines no machine."""
-    session, images, *rest = stated(searched, 3, np.random.default_rng(5))
+    session, images, *rest = stated(searched)
     blurred = [cv2.GaussianBlur(images[1].images[0], (0, 0), 3.0)]
     images = [images[0], replace(images[1], images=blurred), images[2]]
     results = localize_case((session, images, *rest))
@@ -719,7 +734,7 @@ def test_check_reports_which_images_are_sure(simulated, searched):
 
 def test_the_same_images_are_searched_once(searched):
     """Cached poses, edges and rejections are those of the search; other data have another name."""
-    session, images, _, _ = searched = stated(searched, 3, np.random.default_rng(5))
+    session, images, _, _ = searched = stated(searched)
     first, again = localize_case(searched), localize_case(searched)
     assert len(first.scene.edges) == 3
     np.testing.assert_array_equal(again.scene.T_camera_base, first.scene.T_camera_base)

@@ -94,7 +94,7 @@ class StationView:
     guessed : (H, K, L) hypothetical legs in the images, base frame, one for each candidate pose (or
         H = 1); None where the legs follow the readings.
     options : of the likelihood.
-    earlier_joints : (E, m) readings of the same machine in other sessions, None for none; rivals of
+    earlier_joints : (E, m) readings of the same machine at other poses, None for none; rivals of
         the images' own.
     """
 
