@@ -15,6 +15,7 @@ from pkmcal.api.check import CheckResult
 from pkmcal.boards.prints import Print
 from pkmcal.boards.stations import find_boards
 from pkmcal.boards.views import Boards, StationBoard
+from pkmcal.calibration.handheld import localize_case
 from pkmcal.calibration.localization import (
     boards_of,
     check_observable,
@@ -25,7 +26,7 @@ from pkmcal.calibration.localization import (
 )
 from pkmcal.checks.check import check_session
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import apply, inverse, pose, pose_difference, rotation
+from pkmcal.geometry.rigid import angle_between, apply, inverse, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Level
 from pkmcal.session.load import load_session
@@ -311,3 +312,23 @@ def test_a_board_on_the_platform_gives_a_measurement_a_image(observed):
     assert len(boards.poses) == 8
     assert boards.poses.configuration.tolist() == [0, 1, 2, 3, 4, 5, 6, 7]
     assert all(isinstance(s, StationBoard) and s.stood is None for s in boards.stations.values())
+
+
+def test_hand_held_images_with_poses_of_their_own_and_a_board(rendered, observed):
+    """The board does not replace the poses that a person states."""
+    session, images, _ = observed
+    truth = load_truth(rendered, session.machine)
+    stations, single = [], []
+    for p, station in zip(images, session.stations, strict=True):
+        for k, image in enumerate(station.images):
+            single.append(replace(p.select(np.array([k])), station=len(stations)))
+            name = f"{station.name}-{k}"
+            stations.append(replace(station, name=name, handheld=True, images=(image,)))
+    session = replace(session, stations=tuple(stations))
+    boards = boards_of(session, single)
+    assert len(boards.stations) == len(stations) == 8
+    results = localize_case(session, single, boards, np.random.default_rng(0))
+    names = [one.name for one in results.session.stations]
+    assert len(names) > 4
+    true = truth.T_camera_base[[truth.stations.index(name.rpartition("-")[0]) for name in names]]
+    assert np.degrees(angle_between(results.scene.T_camera_base, true)).max() < 4

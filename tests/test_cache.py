@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pkmcal.files import (
-    cached_arrays,
     digest_of,
     remember,
     remember_arrays,
@@ -59,15 +58,14 @@ def test_a_damaged_file_counts_as_absent(folder, damage):
     assert remembered_arrays("a") is None
 
 
-def test_the_oldest_arrays_are_removed(folder, monkeypatch):
+def test_the_oldest_arrays_are_removed(folder):
     noise = np.random.default_rng(0).integers(0, 2**62, 1000)
-    monkeypatch.setattr(cached_arrays, "MOST_CACHED_BYTES", 20_000)
     for age, name in enumerate("abc"):
         remember_arrays(name, {"x": noise})
         (path,) = folder.rglob(f"{name}.npz")
         os.utime(path, (age, age))
     assert remembered_arrays("b") is not None  # and counts as used just now
-    remember_arrays("d", {"x": noise})
+    remember_arrays("d", {"x": noise}, most_bytes=20_000)
     assert sorted(path.stem for path in folder.rglob("*.npz")) == ["b", "d"]
 
 

@@ -74,6 +74,22 @@ def test_edges_of_a_machine_that_is_elsewhere_are():
     assert f"Of {in_sight} edges in sight only {len(in_view.edges)} were measured" in why.text
 
 
+def test_a_rejected_edge_is_one_edge_in_sight():
+    """Whether the estimate rejected it, or one of its repeats was an outlier."""
+    turns = turns_of(displaced(taken(), 2.5 * IMAGE_OFFSET))
+    (before,) = chance_match_reason(turns)
+    edges, in_view = turns.observation.edges, turns.observation
+    outlier = edges.rejection(0, "disagrees with all other edges")
+    repeats = [edges.rejection(1, f"{k} sigmas away", "repeats.outlier") for k in (7, 8)]
+    rejected = (*in_view.rejected, outlier, *repeats)
+    weights = np.where(np.arange(len(edges)) == 0, 0.0, 1.0)
+    estimate = SimpleNamespace(**{**vars(turns.estimate), "edge_weights": weights})
+    (after,) = chance_match_reason(
+        turns._replace(observation=replace(in_view, rejected=rejected), estimate=estimate)
+    )
+    assert after.facts == before.facts
+
+
 def test_most_edges_of_the_right_machine_are_no_chance():
     assert chance_match_reason(turns_of(taken())) == ()
 

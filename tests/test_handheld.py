@@ -24,8 +24,14 @@ from pkmcal.calibration.handheld import (
     without_misplaced,
 )
 from pkmcal.calibration.localization import platform_poses, read_images
+from pkmcal.calibration.localization_cache import (
+    image_name,
+    remember_image,
+    remember_session,
+    remembered_session,
+    session_name,
+)
 from pkmcal.calibration.pose_scoring import (
-    ScoredPoses,
     evaluate_pose,
     register_images,
     rescore_poses,
@@ -50,8 +56,7 @@ from pkmcal.judge.new_data import measured_new_data
 from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
 from pkmcal.measurements.effects import FOCAL_EXCESS, FOCAL_SIGMA, SHADING
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe import background, legs
-from pkmcal.observe.background import Texture
+from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.image_localization import (
     PoseHypotheses,
@@ -589,53 +594,26 @@ def view_of(session, p, poses):
     return StationView(session.machine, p.camera, p.configuration, session.joints, poses, tables)
 
 
-def localized_with(monkeypatch, truth, faults, textured=False):
-    """Images are localized where they were taken, with uncertainty; textured : with a
-    background.
+def localized(searched, faults):
+    """Cache a localization of the session in which images are where they were taken, each with the
+    probability of a rival, and those with more than one in a hundred not accepted.
     """
-
-    def measure(_session, image, _before, _poses, _others, _configurations):
-        T, fault = truth.T_camera_base[image.station], faults[image.station]
-        lead = np.log(1 / fault - 1)
-        places = PoseHypotheses(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
-        return places, ScoredPoses.nothing()
-
-    nowhere = PoseHypotheses(np.eye(4)[None], np.zeros(1), 1.0)
-    monkeypatch.setattr(handheld, "localize_image", lambda *_: nowhere)
-    monkeypatch.setattr(handheld, "rescore_poses", measure)
-    monkeypatch.setattr(handheld, "THREADS", 1)
-    if not textured:
-        empty = Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
-        monkeypatch.setattr(background, "texture_of", lambda *_: empty)
+    session, images, _, truth = searched
+    unplaced = PriorScene.as_drawn(session, np.full((len(faults), 4, 4), np.nan))
+    places, T_camera_base = {}, truth.T_camera_base.copy()
+    for k, wrong in enumerate(faults):
+        ratios = np.array([9 + np.log(1 / wrong - 1), 9.0])
+        places[k] = PoseHypotheses(np.stack([T_camera_base[k], np.eye(4)]), ratios, 1.0)
+        if wrong > 0.01:
+            T_camera_base[k] = np.nan
+    name = session_name(session, [p.station for p in images], Boards(), unplaced)
+    remember_session(name, (places, unplaced._replace(T_camera_base=T_camera_base)))
+    return name
 
 
-def placed(remeasured, monkeypatch, faults, textured=False):
-    """Poses of images that are localized right, with uncertainty; none : localized elsewhere."""
-    session, images, _, truth = remeasured
-    localized_with(monkeypatch, truth, faults, textured)
+def localize_case(searched):
+    session, images, *_ = searched
     return handheld.localize_case(session, images, Boards(), np.random.default_rng(0))
-
-
-@pytest.mark.slow
-def test_the_room_may_decide_what_legs_do_not(searched, monkeypatch):
-    """All images show some of the same points about the machine."""
-    _, images, _, truth = searched
-    rng = np.random.default_rng(2)
-    world = rng.uniform(-1.2, 1.2, (6000, 3))
-    names = rng.standard_normal((len(world), 128)).astype(np.float32)
-    names /= np.linalg.norm(names, axis=1, keepdims=True)
-
-    def texture(image, camera, _options):
-        k = next(k for k, p in enumerate(images) if p.images[0] is image)
-        visible = apply(truth.T_camera_base[k], world)
-        pixel = camera.project(np.where(visible[:, 2:] > 0.1, visible, np.nan))
-        with np.errstate(invalid="ignore"):
-            inside = ((pixel > 0) & (pixel < camera.image_size)).all(axis=1)
-        return Texture(camera.ray(pixel[inside]), pixel[inside], names[inside])
-
-    monkeypatch.setattr(background, "texture_of", texture)
-    results = placed(searched, monkeypatch, [1e-4, 0.3, 1e-4], textured=True)
-    assert [s.name for s in results.session.stations] == [s.name for s in searched[0].stations]
 
 
 def posed(folder, words):
@@ -666,19 +644,16 @@ def test_a_board_on_the_base_serves_images_by_hand(folder):
     assert not any("board" in values for values in load_session(folder).warnings)
 
 
-def test_unsure_images_are_left_out_and_reported(searched, monkeypatch):
-    results = placed(searched, monkeypatch, [1e-4, 0.3, 1e-4])
+def test_unsure_images_are_left_out_and_reported(searched):
+    localized(searched, [1e-4, 0.3, 1e-4])
+    results = localize_case(searched)
     assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert [p.station for p in results.images] == [0, 1]
-    off = pose_difference(results.scene.T_camera_base, searched[3].T_camera_base[[0, 2]])
-    # as in the joint estimate: two images hardly determine a machine
-    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
-    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
-    (warning,) = results.session.warnings
-    assert warning.startswith(
-        "images/phone/0001-1.jpg: left out, for its edges fit the legs nearly"
-    )
-    assert "probability 0.30" in warning
+    truth = searched[3].T_camera_base
+    np.testing.assert_array_equal(results.scene.T_camera_base, truth[[0, 2]])
+    (rejected,) = results.session.rejected
+    assert rejected.station.name == "phone-0001-1"
+    assert "probability 0.30" in rejected.finding.facts["reason"]
 
 
 def test_places_are_believed_while_all_together_leave_little_doubt():
@@ -692,22 +667,48 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
     assert handheld._sure({}, 5) == []
 
 
-@pytest.mark.slow
-def test_an_image_in_which_no_leg_can_be_measured_is_left_out(searched, monkeypatch):
-    """However well its silhouettes match something: it determines no machine."""
-    rows = []
+def stated(searched, numbers=(0, 1, 2)):
+    """The session with rough poses of some images."""
+    session, images, poses, truth = searched
+    rough = perturb(truth.T_camera_base, 0.03 * np.random.default_rng(5).normal(size=(3, 6)))
+    stations = [
+        replace(station, T_camera_base=rough[k]) if k in numbers else station
+        for k, station in enumerate(session.stations)
+    ]
+    return replace(session, stations=tuple(stations)), images, poses, truth
 
-    def bare(scene, image):
-        rows.append(sorted(scene.edges))
-        return image.station == 1
 
-    monkeypatch.setattr(handheld, "_too_few_edges", bare)
-    results = placed(searched, monkeypatch, [1e-4, 1e-4, 1e-4])
+def test_poses_by_hand_place_images(searched):
+    results = localize_case(stated(searched))
+    assert not results.session.rejected
+    off = pose_difference(results.scene.T_camera_base, searched[3].T_camera_base)
+    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
+
+
+def test_a_pose_by_hand_joins_images_that_are_searched(searched):
+    """Whose poses by themselves are cached, and scored with all images."""
+    session, images, poses, truth = stated(searched, [1])
+    for k in (0, 2):
+        alone = PoseHypotheses(truth.T_camera_base[k : k + 1], np.array([20.0]), 1.0)
+        remember_image(image_name(session, session.machine, k), alone)
+    results = localize_case((session, images, poses, truth))
+    assert not results.session.rejected
+    off = pose_difference(results.scene.T_camera_base, truth.T_camera_base)
+    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
+
+
+def test_an_image_in_which_no_leg_can_be_measured_is_left_out(searched):
+    """However well its silhouettes match, as of a shaken camera: it determines no machine."""
+    session, images, *rest = stated(searched)
+    blurred = [cv2.GaussianBlur(images[1].images[0], (0, 0), 3.0)]
+    images = [images[0], replace(images[1], images=blurred), images[2]]
+    results = localize_case((session, images, *rest))
     assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert sorted(results.scene.edges) == [0, 1]
-    (warning,) = results.session.warnings
-    assert warning.startswith("images/phone/0001-1.jpg: left out, for too few of its edges agree")
-    assert len(rows) < 12  # the scoring ends
+    (rejected,) = results.session.rejected
+    assert rejected.finding.facts["reason"] == EDGES_DISAGREE_REASON
 
 
 def test_legs_are_measured_where_an_image_is_and_not_elsewhere(searched):
@@ -720,83 +721,80 @@ def test_legs_are_measured_where_an_image_is_and_not_elsewhere(searched):
     assert handheld._too_few_edges(elsewhere, p)
 
 
-def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):
-    localized_with(monkeypatch, searched[3], [1e-4, 0.3, 1e-4])
+def test_check_reports_which_images_are_sure(simulated, searched):
+    localized(searched, [1e-4, 0.3, 1e-4])
     check = check_session(simulated)
     assert [station.recognised for station in check.stations] == [True, False, True]
     assert check.stations[0].legs > 2
-    words = [finding.text for finding in check.findings]
-    assert any(
-        text.startswith("images/phone/0001-1.jpg: left out, for its edges") for text in words
-    )
-    assert not any("not localized" in text for text in words)
+    rejected = [one.facts["station"] for one in check.findings if one.code == "rejected.image"]
+    assert rejected == ["phone-0001-1"]
+    assert "station.not_recognised" not in {one.code for one in check.findings}
     assert check.forecast is None
 
 
-def test_the_same_images_are_searched_once(searched, monkeypatch):
-    """Cached poses, edges and rejections are those of the search; other data are searched."""
-    session, images, _, _ = searched
-    first = placed(searched, monkeypatch, [1e-4, 0.3, 1e-4])
-
-    def searched_again(*_):
-        raise RuntimeError
-
-    monkeypatch.setattr(handheld, "rescore_poses", searched_again)
-    arguments = images, Boards(), np.random.default_rng(0)
-    again = handheld.localize_case(session, *arguments)
+def test_the_same_images_are_searched_once(searched):
+    """Cached poses, edges and rejections are those of the search; other data have another name."""
+    session, images, _, _ = searched = stated(searched)
+    first, again = localize_case(searched), localize_case(searched)
+    assert len(first.scene.edges) == 3
     np.testing.assert_array_equal(again.scene.T_camera_base, first.scene.T_camera_base)
     np.testing.assert_array_equal(again.scene.machine.values, first.scene.machine.values)
-    assert again.session.warnings == first.session.warnings
     for k, edges in first.scene.edges.items():
         np.testing.assert_array_equal(again.scene.edges[k].normal, edges.normal)
         np.testing.assert_array_equal(again.scene.edges[k].coarse, edges.coarse)
-    noisier = replace(session, joint_noise=2 * session.joint_noise)
-    with pytest.raises(RuntimeError):
-        handheld.localize_case(noisier, *arguments)
-    # a file of something else under the right name
     (path,) = cache_folder().glob("session-*.npz")
+    stations, unplaced = (
+        [p.station for p in images],
+        PriorScene.as_drawn(session, np.full((3, 4, 4), np.nan)),
+    )
+    assert session_name(session, stations, Boards(), unplaced) == path.stem
+    noisier = replace(session, joint_noise=2 * session.joint_noise)
+    warmer = replace(session, temperature=np.array([20.0, 21.0, 22.0]))
+    for other in (noisier, warmer):
+        assert session_name(other, stations, Boards(), unplaced) != path.stem
+    boards = Boards(tolerance=0.01)
+    assert session_name(session, stations, boards, unplaced) != path.stem
+    # a file of something else under the right name
     np.savez(path, images=np.arange(3))
-    with pytest.raises(RuntimeError):
-        handheld.localize_case(session, *arguments)
+    assert remembered_session(path.stem, session.machine) is None
 
 
 @pytest.mark.slow
-def test_new_data_of_a_calibrated_machine_use_the_same_poses(searched, monkeypatch):
-    """Which `check` and `calibrate` cached, by the session's nominal model."""
-    session, _, _, truth = searched
-    first = placed(searched, monkeypatch, [1e-4, 1e-4, 1e-4])
-
-    def searched_again(*_):
-        raise RuntimeError
-
-    monkeypatch.setattr(handheld, "rescore_poses", searched_again)
-    saved = SimpleNamespace(machine=truth.machine, document={"stations": []})
+def test_new_data_of_a_calibrated_machine_use_the_same_poses(searched):
+    """Which `check` and `calibrate` cached, by the session's nominal model; readings of the
+    calibration at the session's own poses are no rivals of these.
+    """
+    session = searched[0]
+    name = localized(searched, [1e-4, 1e-4, 1e-4])
+    machine = session.machine.with_values(session.machine.values + 1e-6)
+    others = session.joints + 0.01
+    saved = SimpleNamespace(
+        machine=machine,
+        document={"stations": []},
+        joints=np.concatenate([others, session.joints]),
+        used=np.ones(6, dtype=bool),
+    )
     value = measured_new_data(saved, session, 0, no_progress)
-    assert value.session.machine is truth.machine
-    names = [station.name for station in first.session.stations]
-    assert [station.name for station in value.session.stations] == names
+    assert value.session.machine is machine
+    assert len(value.session.stations) == 3
+    np.testing.assert_array_equal(value.session.earlier_joints, others)
+    # nothing was searched
+    assert [path.stem for path in cache_folder().glob("*.npz")] == [name]
 
 
-def test_a_pose_by_hand_places_an_ambiguous_image(searched, monkeypatch):
-    session, images, poses, truth = searched
-    rough = perturb(truth.T_camera_base[1], np.array([0.03, -0.03, 0.02, 0.02, -0.02, 0.03]))
-    first, second, third = session.stations
-    posed = replace(session, stations=(first, replace(second, T_camera_base=rough), third))
-    assert placed(searched, monkeypatch, [1e-4, 0.3, 1e-4]).session.rejected
-    results = placed((posed, images, poses, truth), monkeypatch, [1e-4, 0.3, 1e-4])
-    assert not results.session.rejected
-    off = pose_difference(results.scene.T_camera_base, truth.T_camera_base)
-    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
+def test_no_image_by_hand_is_localized(searched):
+    localized(searched, [0.3, 0.3, 0.3])
+    with pytest.raises(InputError) as caught:
+        localize_case(searched)
+    assert caught.value.where.endswith("stations.phone")
+    assert "probability 0.30" in caught.value.found
 
 
-def test_no_image_by_hand_is_localized(searched, monkeypatch):
-    with pytest.raises(InputError, match="localized in none of the hand-held images"):
-        placed(searched, monkeypatch, [0.3, 0.3, 0.3])
-
-
-def test_images_of_one_configuration_are_localized(searched, monkeypatch):
-    with pytest.raises(InputError, match="localized images show one configuration only"):
-        placed(searched, monkeypatch, [0.3, 1e-4, 0.3])
+def test_images_of_one_configuration_are_localized(searched):
+    localized(searched, [0.3, 1e-4, 0.3])
+    with pytest.raises(InputError) as caught:
+        localize_case(searched)
+    assert caught.value.found.startswith("0001;")
 
 
 def test_an_image_in_a_wrong_place_is_found_out(breathed):

@@ -174,6 +174,7 @@ def calibrate_session(
     progress: Progress = no_progress,
     options: RefinementOptions = REFINEMENT,
     case: Case | None = None,
+    localized_by: Machine | None = None,
 ) -> Calibration:
     """Calibrate the machine of a session; nothing is written.
 
@@ -188,6 +189,7 @@ def calibrate_session(
     progress : called with the step in words and the share done.
     options : of the measurement passes.
     case : session with its images localized; by default they are localized here.
+    localized_by : machine by which the images are localized, by default the session's.
 
     Raises InputError where the session is at fault, ResultError where there is no estimate.
     """
@@ -200,7 +202,9 @@ def calibrate_session(
         clock = Clock(progress)
         session = _load(session, refine_camera, holdout, clock)
         share = localization_share(session)
-        located = case or observed_case(session, seed, clock.part(0, share))
+        nominal = replace(session, machine=localized_by or session.machine)
+        located = case or _observe(nominal, seed, clock.part(0, share))
+        located = located._replace(session=replace(located.session, machine=session.machine))
 
         def calibrated(refine: bool, first: float, last: float) -> Calibration:
             own = clock.part(first, last)
@@ -379,7 +383,7 @@ def settle(
             repaired = session
             for one in repairs:
                 repaired = one.hypothesis.apply(repaired)
-            case = observed_case(repaired, seed, now.part(0.9, 1))
+            case = _observe(repaired, seed, now.part(0.9, 1))
             continue
         # stations with a wrong localized pose
         wrong = misplaced_stations(case.session, turns) or inconsistent_poses(
@@ -446,7 +450,7 @@ def _load(
     return session
 
 
-def observed_case(session: Session, seed: int, clock: Clock) -> Case:
+def _observe(session: Session, seed: int, clock: Clock) -> Case:
     """Case of a session with its stations localized, without hand-held images that were not
     localized.
 

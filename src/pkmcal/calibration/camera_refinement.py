@@ -197,8 +197,9 @@ def measurements_of(
 ) -> Measurements:
     """Measurements of a session's images and tables, by the present cameras.
 
-    cameras : None for the first, coarse estimate, which cannot refine any. estimate : an earlier
-    one, by which effects on the readings are; by the nominal machine without it.
+    cameras : None for the first, coarse estimate, which cannot refine any.
+    estimate : earlier estimate, at whose machine and poses the effects on the readings are
+        evaluated; None for the nominal ones.
     """
     # Mounts: the board, then each tracker's target, then the points of links.
     mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []

@@ -29,7 +29,6 @@ from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.outcome.hypotheses import OPTIONS, Explanation
 from pkmcal.session.load import Session
-from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import how_often
 
 IMAGE_OFFSET = 2 * legs.LEG_SEARCH_OPTIONS.reach
@@ -125,15 +124,17 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     chance.
     """
     in_view = turns.observation
-    mine = np.isin(in_view.edges.station, stations)
-    measured = int(np.sum(mine & ~in_view.edges.coarse))
-    missed = sum(
-        r.side >= 0 and r.code != "edges.out_of_sight" and r.station in stations
+    edges = in_view.edges.select(np.isin(in_view.edges.station, stations))
+    measured = int(np.sum(~edges.coarse))
+    # a measured edge may be among the rejections as well: rejected by the estimate, or in one of
+    # several repeats
+    columns = edges.station, edges.configuration, edges.leg, edges.tube, edges.side
+    visible = set(zip(*(column.tolist() for column in columns), strict=True)) | {
+        (r.station, r.configuration, r.leg, r.tube, r.side)
         for r in in_view.rejected
-    )
-    # edges that the estimate rejected are counted twice, as measured and as rejected
-    given_up = int(np.sum(mine & (turns.estimate.edge_weights < INLIER_WEIGHT)))
-    in_sight = int(np.sum(mine)) + missed - given_up
+        if r.side >= 0 and r.code != "edges.out_of_sight" and r.station in stations
+    }
+    in_sight = len(visible)
     if not turns.images or measured >= FEW * in_sight:
         return None
     angle = 2 * np.pi * np.arange(OFFSET_DIRECTIONS) / OFFSET_DIRECTIONS

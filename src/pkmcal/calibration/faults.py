@@ -107,10 +107,11 @@ def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
 
 
 def _rounding(session: Session, noise: float) -> dict[str, Any]:
-    """Facts on the step of which all readings are whole multiples, where its rounding scatters more
-    than session.yaml states; none otherwise.
+    """Facts on the step of which all readings are whole multiples, if its rounding scatters more
+    than session.yaml states: ``rounded_to`` and ``rounding`` (m or rad) if the rounding explains
+    the noise, ``round_command`` otherwise; none without such a step.
 
-    noise : by which the readings scatter, m or rad.
+    noise : standard deviation of the readings, m or rad.
     """
     units = set(session.machine.joint_units)
     least = np.sqrt(12) * session.joint_noise

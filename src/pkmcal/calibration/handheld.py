@@ -37,7 +37,12 @@ from pkmcal.calibration.localization_cache import (
     remembered_session,
     session_name,
 )
-from pkmcal.calibration.pose_scoring import ScoredPoses, register_images, rescore_poses
+from pkmcal.calibration.pose_scoring import (
+    PoseScoringOptions,
+    ScoredPoses,
+    register_images,
+    rescore_poses,
+)
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
 from pkmcal.identify.bundle import MarginalPrior
@@ -87,12 +92,12 @@ class HandheldOptions:
     most_rounds: int = 2
     # ratio by which the number of images that determine the machine must grow before the poses of
     # an image are scored anew
-    rescoring_growth: float = 1.25
+    rescoring_growth: float = PoseScoringOptions.refined_again_growth
     # factor on the number of hypotheses with which an ambiguous image is localized once more
     wider: int = 3
-    # distances from the camera of a neighbour that are tried for an image, relative to the
-    # neighbour's distance from the base: from a step to the opposite side; their ratio is that of
-    # the search of a single image
+    # distances from the camera of a neighbour that are tried for an image, relative to the median
+    # distance of the cameras from the base: from a step to the opposite side; their ratio is that
+    # of the search of a single image
     apart: Array = field(default_factory=lambda: np.geomspace(0.15, 2.5, 18))
     # largest rotation (rad) by which the joint estimate may change an image's localized pose
     most_turn: float = SAME_POSE_TURN / 2
@@ -110,7 +115,7 @@ _OPTIONS = HandheldOptions()
 class Localization:
     """Poses of all stations of a session, from their images; no error is raised.
 
-    recognition : of the machine in the images on tripods, None if none was searched.
+    leg_localization : of the images on tripods, None if none was searched.
     places : pose hypotheses of each hand-held image, by station number.
     result : the case without the rejected hand-held images, or the error if there is none.
     """
@@ -241,8 +246,10 @@ def _searched(
             answers[k] = one
             progress(f"{text}: {done} of {len(some)}", done / len(some))
 
-    def believed() -> Array:
-        return _believed(hypotheses(), len(by_hand) + len(stated), boards, scene.T_camera_base)
+    def accepted_poses() -> Array:
+        return _accepted_poses(
+            hypotheses(), len(by_hand) + len(stated), boards, scene.T_camera_base
+        )
 
     with ThreadPoolExecutor(THREADS) as pool:
         # each image by itself
@@ -251,31 +258,32 @@ def _searched(
             answers[k] = _CachedHypotheses(one, one)
             done = len(answers)
             progress(
-                f"Localizing images by hand: {done} of {len(by_hand)}", 0.3 * done / len(by_hand)
+                f"Localizing hand-held images: {done} of {len(by_hand)}", 0.3 * done / len(by_hand)
             )
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = min((len(clearer) + 1) // 2, _OPTIONS.most_from_nominal)
         rescore(clearer[:half], "Scoring the least ambiguous images", part(progress, 0.3, 0.5))
-        so_far = _with_sure(session, at, room, so_far, believed(), boards)
+        so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
         text = f"Scoring the others, with {len(so_far.placed)} images localized"
         rescore(clearer[half:], text, part(progress, 0.55, 0.7))
         # join the images of a board, and score images without an accepted pose again
         for k, one in _on_board(hypotheses(), boards).items():
-            answers[k] = replace(answers[k], places=one)
-        so_far = _with_sure(session, at, room, so_far, believed(), boards)
+            if k in answers:  # poses that the session states remain
+                answers[k] = replace(answers[k], places=one)
+        so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
         rest = part(progress, 0.75, 1)
         for _ in range(_OPTIONS.most_rounds):
-            T = believed()
+            T = accepted_poses()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
             if not so_far.placed or not unsure:
                 break
             placed = len(by_hand) - len(unsure)
             text = f"Scoring again, with {placed} of {len(by_hand)} images localized"
             rescore(unsure, text, part(rest, 0, 0.4))
-            so_far = _with_sure(session, at, room, so_far, believed(), boards)
+            so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
             rest = part(rest, 0.5, 1)
-    out = _placed_at(so_far, believed(), (*by_hand, *stated))
+    out = _final_poses(so_far, accepted_poses(), (*by_hand, *stated))
     untested = tuple(_untested(session, so_far, answers, out))
     return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
 
@@ -299,11 +307,14 @@ def _with_stated(
     return stated, scene._replace(T_camera_base=T_camera_base)
 
 
-def _placed_at(so_far: _LocalizationState, believed: Array, by_hand: Sequence[int]) -> Array:
-    """T_camera_base (S, 4, 4) in the end: estimated for registered images, NaN for those that are
-    not accepted any more and where too few legs can be measured.
+def _final_poses(so_far: _LocalizationState, T_camera_base: Array, by_hand: Sequence[int]) -> Array:
+    """Poses (S, 4, 4): estimated ones for registered images, NaN for images that are not accepted
+    any more and for those in which too few legs can be measured.
+
+    T_camera_base : (S, 4, 4) accepted poses, NaN for images without.
+    by_hand : station numbers of the hand-held images.
     """
-    out = believed.copy()
+    out = T_camera_base.copy()
     for k in by_hand:
         if k in so_far.scene.edges and not np.isnan(out[k]).any():
             out[k] = so_far.scene.T_camera_base[k]
@@ -370,15 +381,15 @@ def _with_sure(
     images: Mapping[int, StationImages],
     room: Surroundings,
     so_far: _LocalizationState,
-    believed: Array,
+    T_camera_base: Array,
     boards: Boards,
 ) -> _LocalizationState:
     """State with all accepted images registered; unchanged without new ones.
 
-    believed : T_camera_base (S, 4, 4), NaN for images without an accepted pose.
+    T_camera_base : (S, 4, 4), NaN for images without an accepted pose.
     """
     scene = so_far.scene
-    sure = {k: T for k, T in enumerate(believed) if k in images and not np.isnan(T).any()}
+    sure = {k: T for k, T in enumerate(T_camera_base) if k in images and not np.isnan(T).any()}
     new = {k: T for k, T in sure.items() if k not in scene.edges}
     if not new:
         return so_far
@@ -560,7 +571,7 @@ def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
     ]
 
 
-def _believed(
+def _accepted_poses(
     hypotheses: Mapping[int, PoseHypotheses], count: int, boards: Boards, prior_poses: Array
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of the accepted images and those connected to them by a board.

@@ -409,7 +409,7 @@ def frozen_in(session: Session) -> InputError | None:
 class StationSearch(NamedTuple):
     """Poses of all stations.
 
-    recognition : localization by the legs, None if no images were searched.
+    leg_localization : localization by the legs, None if no images were searched.
     T_camera_base : (S, 4, 4), NaN for hand-held images that are not localized yet.
     error : why another station has no pose, or the mistake that explains its images; poses are then
         incomplete.
@@ -491,7 +491,7 @@ def prior_station_poses(session: Session, boards: Boards) -> Array:
 
     As the session states, or by a board; NaN where there is neither.
     """
-    # the pose of a single image by hand is too rough for the images that a board joins to it
+    # the pose of a hand-held image is too rough for the images that a board joins to it
     given = [None if one.handheld else one.T_camera_base for one in session.stations]
     given = boards.joined(given) + _tracker_starts(session)
     T_camera_base = np.array([np.full((4, 4), np.nan) if T is None else T for T in given])

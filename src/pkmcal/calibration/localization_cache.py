@@ -1,7 +1,8 @@
 """Localization of hand-held images in the user's cache folder.
 
-The digest of image files, cameras, readings and nominal model names the result, so that every
-command that localizes the same images uses the same poses, and images are searched once.
+The digest of image files, cameras, readings, temperatures, boards and nominal model names the
+result, so that every command that localizes the same images uses the same poses, and images are
+searched once.
 """
 
 from __future__ import annotations
@@ -45,14 +46,19 @@ def session_name(
     stations : that observe legs. scene : of the nominal model.
     """
     stood = [(k, one.stood and one.stood.T_camera_board) for k, one in boards.stations.items()]
+    poses, temperature = boards.poses, session.temperature
     digest = digest_of(
         session.machine.to_document(),
         session.machine.values,
         session.joints,
         session.joint_noise,
+        np.zeros(0) if temperature is None else temperature,
         [[k, session.stations[k].handheld, _stated(session, k)] for k in stations],
         [k for k, _ in stood],
         *(np.zeros(0) if T is None else T for _, T in stood),
+        [boards.body, boards.tolerance],
+        poses.T_station_target,
+        poses.whiten,
         scene.T_camera_base,
     )
     return f"session-{digest}"

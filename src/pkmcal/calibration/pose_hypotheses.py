@@ -590,8 +590,9 @@ def _jump(measurements: Measurements, estimate: Estimate, rows: Integers) -> int
     """Number of poses before a jump of the board on the platform.
 
     The split with the smallest spread about the medians of the two parts, all six numbers in units
-    of
-    their own spread. rows : (n,) of one station and one mount, in the order of configurations.
+    of their own spread.
+
+    rows : (n,) of one station and one mount, in the order of configurations.
     """
     poses, state = measurements.poses, estimate.state
     k = poses.configuration[rows]

@@ -2,13 +2,14 @@
 growth.
 
 An effect has k coefficients with a prior: the compliance of the drives relative to what the file
-states, the growth of drives and frame per kelvin (:mod:`pkmcal.mechanisms.disturbances`). What its
-mean does to the readings is a known correction, and what is left of the coefficients are unknowns
-of the estimate, with a column each (:mod:`pkmcal.measurements.columns`). The calibrated machine's
-file states the estimated coefficients, so that they apply to its later sessions.
+states, the growth of drives and frame per kelvin (:mod:`pkmcal.mechanisms.disturbances`). The
+change of the readings by the prior mean is a known correction; the deviations of the coefficients
+from the mean are unknowns of the estimate, with one column for each effect
+(:mod:`pkmcal.measurements.columns`). The calibrated machine's file states the estimated
+coefficients, so that they apply to its later sessions.
 
-Forces and growth are those of a machine at its poses: of the nominal one at the readings, which is
-right to first order, then of an estimate.
+Forces and growth are evaluated for the nominal machine at its readings first, which is right to
+first order, then for an earlier estimate at its poses.
 """
 
 from __future__ import annotations
@@ -40,8 +41,10 @@ THERMAL_GROWTH, COMPLIANCE = "readings.growth", "machine.compliance"
 class ReadingEffect:
     """Effect of k coefficients on the readings.
 
-    code : of its column. by : (K, m, k) change of the readings by the coefficients. mean : (k,),
-    root : (k, k) square root of their prior covariance.
+    code : of its column.
+    by : (K, m, k) derivative of the readings by the coefficients.
+    mean, root : (k,) prior mean of the coefficients, and (k, k) square root of their prior
+        covariance.
     """
 
     code: str
@@ -53,17 +56,17 @@ class ReadingEffect:
 
     @property
     def correction(self) -> Array:
-        """What the mean does to the readings, (K, m)."""
+        """Change (K, m) of the readings by the mean of the coefficients."""
         return self.by @ self.mean
 
     def __call__(self, measurements: Measurements) -> Iterator[Column]:
-        """Column of what is left of the coefficients."""
+        """Column of the deviations of the coefficients from their mean."""
         del measurements
         yield Column(self.code, readings=self.by, prior=self.root)
 
     def estimated(self, estimate: Estimate) -> tuple[Array, Array]:
-        """Coefficients (k,) of an estimate and their covariance (k, k); the prior's of an estimate
-        without them.
+        """Coefficients (k,) of an estimate and their covariance (k, k); those of the prior if they
+        are no unknowns of the estimate.
         """
         if self.code not in estimate.column_covariance:
             return self.mean, self.root @ self.root.T
@@ -76,7 +79,9 @@ class ReadingEffect:
 def reading_effects(
     machine: Machine, joints: Array, poses: Array, temperature: Array | None
 ) -> tuple[ReadingEffect, ...]:
-    """Effects on the readings joints (K, m) at poses (K, 4, 4) and temperatures (K,), if any."""
+    """Effects on readings (K, m), at poses T_base_platform (K, 4, 4) and temperatures (K,), °C,
+    None without temperatures.
+    """
     out: list[ReadingEffect] = []
     if compliance(machine) is not None:
         root = np.full((1, 1), machine.document.tolerance.stiffness or STIFFNESS_TOLERANCE)
@@ -101,7 +106,7 @@ def effects_of_session(
 ) -> tuple[ReadingEffect, ...]:
     """Effects on a session's readings, by the nominal machine or by an earlier estimate."""
     if session.temperature is None and compliance(session.machine) is None:
-        return ()  # kinematics may fail, or take their time
+        return ()  # forward kinematics are slow, and may fail
     machine, poses = session.machine, session.forward.T_base_platform
     if estimate is not None:
         machine, poses = estimate.machine, estimate.state.T_base_platform

@@ -298,7 +298,7 @@ def imputation_variance(
     try:
         passes = _measurement_passes(session, predictions, turns.blur, turns.scatter, active, done)
     except (PkmcalError, np.linalg.LinAlgError) as error:
-        failures = [str(error)]
+        failures = [str(error)] * len(machines)
         machines, cameras, passes = machines[:0], cameras[:0], list[list[legs.StationEdges]]()
     # and the estimates from them
     for number, (drawn, own, one) in enumerate(zip(machines, cameras, passes, strict=True)):
@@ -695,8 +695,9 @@ def _completed(
 ) -> legs.StationEdges:
     """Edges of a hand-held image, with coarse silhouettes in place of edges that were not measured.
 
-    The pose of such an image is determined by its own few edges, so none should be missing. scatter
-    : ratio of the standard deviation of the coarse edges to the stated one.
+    The pose of such an image is determined by its own few edges, so none should be missing.
+
+    scatter : ratio of the standard deviation of the coarse edges to the stated one.
     """
     state = estimate.state
     view = finest_view(estimate.machine, images, session.joints, state.T_base_platform, tables)

@@ -63,8 +63,10 @@ def remembered_arrays(name: str) -> dict[str, Any] | None:
         return None
 
 
-def remember_arrays(name: str, arrays: Mapping[str, Any]) -> None:
-    """Cache arrays under a name; the oldest arrays are removed if there are too many."""
+def remember_arrays(
+    name: str, arrays: Mapping[str, Any], most_bytes: int = MOST_CACHED_BYTES
+) -> None:
+    """Cache arrays under a name; the oldest are removed if all of them exceed ``most_bytes``."""
     stream = BytesIO()
     np.savez_compressed(stream, **arrays)
     remember(name + _ENDING, stream.getvalue())
@@ -75,5 +77,5 @@ def remember_arrays(name: str, arrays: Mapping[str, Any]) -> None:
         )
         sizes = np.cumsum([state.st_size for state, _ in files])
         for (_, path), size in zip(files, sizes, strict=True):
-            if size > MOST_CACHED_BYTES:
+            if size > most_bytes:
                 path.unlink(missing_ok=True)

@@ -12,17 +12,14 @@ from itertools import compress
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from pkmcal.arrays import Booleans
-from pkmcal.calibration.calibrate import Calibration, Clock, calibrate_session, observed_case
-from pkmcal.calibration.handheld import localization_share
-from pkmcal.calibration.localization import check_observable
+from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras.files import load_camera, written_camera
 from pkmcal.errors import InputError
 from pkmcal.outcome.finding import Finding, doubtful, note
-from pkmcal.outcome.progress import Progress, part
+from pkmcal.outcome.progress import Progress
 from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose
 
@@ -90,23 +87,23 @@ def measured_new_data(
     """Measure a session and estimate all poses; see the module.
 
     The session of the result lacks hand-held images that were not localized, and numbers its
-    stations accordingly. Hand-held images are localized by the session's nominal model, as in
-    `check` and `calibrate`, so that all commands use the same images. seed : of the localization.
+    stations accordingly. seed : of the localization.
     """
-    session = replace(
+    # earlier readings are rivals of the session's own, so they must not be at the same poses
+    earlier = saved.joints[saved.used]
+    owner = same_pose(np.concatenate([session.joints, earlier]), session.joint_noise)
+    new = replace(
         session,
+        machine=saved.machine,
         stations=_as_calibrated(saved, session),
-        earlier_joints=saved.joints[saved.used],
+        earlier_joints=earlier[owner[len(session.joints) :] >= len(session.joints)],
     )
-    calibrated = replace(session, machine=saved.machine)
-    if not any(station.handheld for station in session.stations):
-        return calibrate_session(calibrated, seed=seed, progress=progress)
-    check_observable(session)
-    share = localization_share(session)
-    with threadpool_limits(1, "blas"):
-        case = observed_case(session, seed, Clock(part(progress, 0, share)))
-    case = case._replace(session=replace(case.session, machine=saved.machine))
-    return calibrate_session(calibrated, seed=seed, progress=part(progress, share, 1), case=case)
+    # Stations on tripods are localized by the calibrated machine, because they may have few images.
+    # Hand-held images are localized by the nominal model, as in `check` and `calibrate`: all
+    # commands then use the same images, and cached poses, whose names contain the machine.
+    by_hand = any(station.handheld for station in session.stations)
+    nominal = session.machine if by_hand else None
+    return calibrate_session(new, seed=seed, progress=progress, localized_by=nominal)
 
 
 def _as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:

@@ -67,6 +67,8 @@ class BackgroundOptions:
     # largest number of sets of five matches tried by RANSAC for the relative pose of two images: a
     # share of one correct match in four suffices (derived)
     quintuples: int = 5000
+    # probability of a set without wrong matches at which RANSAC ends before (statistical)
+    confidence: float = 0.999
     # cosine of rays to the optical axis below which they are left out of it: normalized
     # coordinates grow beyond bounds
     least_cosine: float = 0.2
@@ -382,7 +384,9 @@ class Surroundings:
         """Camera poses T_camera_base (n, D, 4, 4) of an image by each of its nearest neighbours.
 
         Two images determine their relative pose up to the distance of the cameras, for which the
-        values ``apart`` (D,), m, are used. Neighbours with too few matches are left out.
+        values ``apart`` (D,), m, are used. Neighbours with too few matches are left out. The
+        relative pose is by the five-point method in RANSAC (Nister, IEEE Transactions on Pattern
+        Analysis and Machine Intelligence 26, 2004).
         """
         import cv2
 
@@ -398,8 +402,9 @@ class Surroundings:
                 continue
             here, there = (np.ascontiguousarray(ray[ok, :2] / ray[ok, 2:]) for ray in rays)
             essential, inside = cv2.findEssentialMat(
-                there, here, np.eye(3), cv2.RANSAC, 0.999, off, self.options.quintuples
-            )
+                there, here, np.eye(3), cv2.RANSAC, self.options.confidence, off,
+                self.options.quintuples,
+            )  # fmt: skip
             if essential is None or essential.shape != (3, 3):  # no solution, or several
                 continue
             _, turn, along, _ = cv2.recoverPose(essential, there, here, np.eye(3), mask=inside)

@@ -228,8 +228,9 @@ def _swapped_stations(
     """Error about two stations whose images are exchanged.
 
     Mirrored images are the rival hypothesis, because the mirror image of a symmetric machine
-    resembles
-    the machine from the other side. stations : localized far from their rough poses, or not at all.
+    resembles the machine from the other side.
+
+    stations : localized far from their rough poses, or not at all.
     """
     placed = [station for station in stations if station.by_hand is not None]
 

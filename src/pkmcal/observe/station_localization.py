@@ -367,9 +367,7 @@ def _best_about(
     rng: np.random.Generator,
     options: LocalizationOptions,
 ) -> Array:
-    """Likeliest poses (H, 4, 4) among refined candidates and perturbations
-    of them.
-    """
+    """Likeliest poses (H, 4, 4) among refined candidates and perturbations of them."""
     candidates = refine_lm(view, candidates, images, 5, options.candidate_reaches)
     candidates, log_likelihood_ratio = refine_ml(view, candidates, images, 3, 2)
     candidates = candidates[np.argsort(-log_likelihood_ratio)]

@@ -145,7 +145,7 @@ class Session:
     rejected : stations that were removed because their images do not determine their poses.
     links : measurements that depend on two configurations, by kind.
     temperature : (K,) °C, of the configurations; None where joints.csv has none.
-    earlier_joints : (E, m) readings of the same machine in other sessions; None for none. The
+    earlier_joints : (E, m) readings of the same machine at other poses; None for none. The
         localization of few images is tested against them as well.
     """
 
