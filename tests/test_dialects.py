@@ -203,7 +203,21 @@ def test_points_of_smoothieware_are_the_nozzles_at_contact(tmp_path):
     text = re.sub(r"X(\S+) Y(\S+) Z(\S+)", r"X:\1 Y:\2 Z:\3 A:1.0 B:1.0 C:1.0", text)
     with pytest.raises(InputError) as caught:
         read_measured(text_file(tmp_path, text, "log.txt"), printer)
+    assert caught.value.code == "printer.probe_travel"
     assert "G29.1" in caught.value.next_step
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_repetiers_probing_has_no_heights(own, tmp_path):
+    """A line is how far the probe moved, from a height that it does not contain."""
+    probed = "".join(
+        f"20:41:3{k}.1 : Z-probe:1{k}.123 X:{k}.00 Y:0.00 zCorr:0.000\n" for k in range(8)
+    )
+    path = text_file(tmp_path, REPETIER + probed if own else REPETIER)
+    log = None if own else text_file(tmp_path, probed, "log.txt")
+    with pytest.raises(InputError) as caught:
+        printer_session_texts(path, log)
+    assert caught.value.code == "printer.probe_travel"
 
 
 @pytest.mark.parametrize(("off", "reported"), [(0.5, False), (16.0, True), (-4.0, True)])

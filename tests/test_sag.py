@@ -202,3 +202,15 @@ def test_an_export_leaves_the_sag_out(to, noted, tmp_path):
         sunk = machine.forward(joints + sag(machine, poses), poses) - poses
         largest = np.linalg.norm(sunk[:, :3, 3], axis=1).max()
         assert note.facts["largest"] == pytest.approx(largest, rel=1e-2)
+
+
+def test_a_compliance_is_positive(tmp_path):
+    """Drives that rise under the load, as with gravity in the wrong direction: nothing named sag,
+    and no result where the file states a stiffness.
+    """
+    unstated = calibrate_session(sagging(tmp_path / "unstated", -STIFFNESS, None))
+    assert "machine.sag" not in {one.code for one in unstated.violations}
+    stated = calibrate_session(sagging(tmp_path / "stated", -STIFFNESS, STIFFNESS))
+    assert not stated.verdict.usable
+    (one,) = stated.verdict.of("machine.compliance_negative")
+    assert one.facts["value"] == pytest.approx(-1, abs=0.1)

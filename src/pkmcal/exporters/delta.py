@@ -782,11 +782,3 @@ def firmware_tool_difference(
         # the fit's error is of first order, so a large one may be 2 % larger
         1.02 * stated_error + TOOL_ROUNDING + MOST_AMPLIFICATION * end_rounding / MM_A_METRE,
     )
-
-
-def redo(source: MachineSource) -> tuple[Finding, ...]:
-    """Measurements to repeat with these values in a firmware; none for a nominal model."""
-    if not source.calibrated:
-        return ()
-    bed = "unknown" if source.bed is None else "probed"
-    return (note("export.redo", radius=workspace_radius(source.machine), bed=bed),)

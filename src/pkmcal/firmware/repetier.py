@@ -8,6 +8,10 @@ each. With the nozzle in the middle at Z max length, after homing, a carriage is
 switch by its endstop offset, in motor steps: the switch triggers at ``Z max length + sqrt(rod^2 -
 radius^2) + offset / steps per mm``.
 
+``Z-probe:10.66 X:0.00 Y:0.00`` of G29, G30 and G33 (Printer.cpp, runZProbe) is how far the probe
+moved down, with corrections, from a height that is not printed and depends on the version: such
+lines have no heights.
+
 All motors have one number of steps per mm, and the firmware rounds towers and rods to whole steps.
 """
 
@@ -28,8 +32,10 @@ from pkmcal.firmware.contract import (
     TOWER_ANGLES,
     Firmware,
     Printer,
+    Touches,
     WrittenValues,
     printer_number,
+    travel_without_start,
 )
 from pkmcal.firmware.towers import (
     SettingNames,
@@ -50,6 +56,7 @@ RADIUS_CORRECTIONS, ROD_CORRECTIONS = (913, 917, 921), (933, 937, 941)
 ZERO_POSITIONS = (133, 137, 141)
 """Positions of X, Y and Z min pos, which move the end switches as well."""
 _EEPROM = re.compile(r"\bEPR:(\d+) (\d+) (\S+)(?: (.{0,60}))?")
+_TRAVEL = re.compile(r"\bZ-probe: ?-?\d{1,4}\.\d{1,6} X:[^\n]{0,60}")
 _WRITTEN = re.compile(r"M206 T(\d) P(\d+) [SX](\S+)(?: ; (.*))?")
 
 
@@ -80,6 +87,19 @@ class Repetier(Firmware):
         Raises InputError for missing, malformed or impossible values.
         """
         return _settings(_eeprom(text, path.name), path.name).printer(self, path.name)
+
+    def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
+        """None without lines of probing. Raises InputError for these, which have no heights."""
+        del printer
+        if (line := _TRAVEL.search(text)) is None:
+            return None
+        raise travel_without_start(
+            path.name,
+            line[0],
+            "the nozzle's positions at contact, in a table configuration,x [mm],y [mm],z [mm]",
+            "At seven places or more, lower the nozzle until it holds a sheet of paper, and write"
+            " X, Y and Z by M114 into such a table",
+        )
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header. Raises InputError for a machine without motor steps."""
