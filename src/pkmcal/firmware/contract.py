@@ -42,6 +42,7 @@ from pkmcal.exporters.delta import (
     workspace_radius,
 )
 from pkmcal.files import closest, quoted, read_text
+from pkmcal.firmware.cables import check_millimetres
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.wording import listed
 
@@ -375,6 +376,7 @@ def firmwares() -> list[Firmware]:
 
 def buildable_delta(printer: Printer) -> Printer:
     """The printer, unchanged. Raises InputError if no delta with these values can be built."""
+    check_millimetres(float(printer.rod.max()), printer.label)
     if not 0 < printer.radius < printer.rod.min():
         raise InputError(
             "a rod has to be longer than the delta radius",

@@ -28,6 +28,7 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length
+from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     TOWER_ANGLES,
     Firmware,
@@ -190,9 +191,16 @@ def _eeprom(text: str, label: str) -> Words:
     out: Words = {}
     for n, line in enumerate(text.splitlines(), 1):
         match = _EEPROM.search(line) or _WRITTEN.match(line.strip())
-        if not match:
-            continue
         where, what = f"{label}, line {n}", "a value of this line"
+        if match is None:
+            if "EPR:" in line:
+                raise InputError(
+                    "this line of the EEPROM is damaged",
+                    where=where,
+                    found=quoted(line.strip()),
+                    expected="EPR:, the type, the position and a number, as M205 prints them",
+                )
+            continue
         expected = "a number in mm, degrees or steps"
         value = printer_number(match[3], what, where, line=match[0], expected=expected)
         out[match[2]] = value, where
@@ -201,17 +209,17 @@ def _eeprom(text: str, label: str) -> Words:
 
 def _settings(eeprom: Words, label: str) -> Settings:
     """Settings of the EEPROM. Raises InputError for missing or impossible values."""
-    for position in (ROD, RADIUS, HEIGHT, STEPS):
+    # M205 prints all of them, so a missing one is no 0
+    for position in (ROD, RADIUS, HEIGHT, STEPS, *SWITCHES, *ANGLES):
         if str(position) not in eeprom:
             raise InputError(
                 f"the EEPROM's value {position} is missing",
                 where=label,
-                expected=f"a line EPR:3 {position} with a number, as M205 prints it",
+                expected=f"a line EPR: with {position} and a number, as M205 prints it",
             )
 
-    def values(positions: tuple[int, ...], *default: float) -> Array:
-        pairs = zip(positions, default or 3 * (0.0,), strict=True)
-        return np.array([eeprom.get(str(k), (value, ""))[0] for k, value in pairs])
+    def values(positions: tuple[int, ...]) -> Array:
+        return np.array([eeprom.get(str(k), (0.0, ""))[0] for k in positions])
 
     for position in (ROD, RADIUS, HEIGHT, STEPS, REACH):
         value, place = eeprom.get(str(position), (1.0, ""))
@@ -229,7 +237,7 @@ def _settings(eeprom: Words, label: str) -> Settings:
     return Settings(
         rod=eeprom[str(ROD)][0] + values(ROD_CORRECTIONS),
         radius=eeprom[str(RADIUS)][0],
-        angle=values(ANGLES, *TOWER_ANGLES),
+        angle=values(ANGLES),
         offset=-values(SWITCHES) / steps,
         height=eeprom[str(HEIGHT)][0],
         probe=(0.0, 0.0, 0.0),
