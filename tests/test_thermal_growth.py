@@ -10,6 +10,7 @@ import pytest
 import pkmcal
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.saved_calibration import load
+from pkmcal.errors import InputError
 from pkmcal.files import csv_text, yaml_text
 from pkmcal.judge.validate import validate_calibration
 from pkmcal.judge.watch import watch_machine
@@ -74,12 +75,20 @@ def test_growth_is_estimated(name, tmp_path):
 
 @pytest.mark.parametrize("head", ["temperature", "temperature [K]", "temperature (°C)"])
 def test_temperatures_are_the_last_column(head, tmp_path):
-    made = warmed(tmp_path / "session", 0.0, 0.0, head=head)
+    T = 35 - 15 * np.cos(np.linspace(0, 2 * np.pi, 40)) + 273.15 * ("K" in head)
+    made = warmed(tmp_path / "session", 0.0, 0.0, head=head, T=T)
     session = load_session(made.folder)
     assert session.joints.shape == (40, 6)
     assert np.ptp(session.temperature) == pytest.approx(30, abs=0.1)
-    celsius = 35 - 273.15 * ("K" in head)
-    assert session.temperature.mean() == pytest.approx(celsius, abs=0.5)
+    assert session.temperature.mean() == pytest.approx(35, abs=0.5)
+
+
+@pytest.mark.parametrize(("head", "shift"), [("temperature", 273.15), ("temperature [K]", -20.0)])
+def test_temperatures_in_another_unit_than_their_head(head, shift, tmp_path):
+    made = warmed(tmp_path / "session", 0.0, 0.0, head=head, T=np.linspace(20, 21, 10) + shift)
+    with pytest.raises(InputError) as caught:
+        load_session(made.folder)
+    assert caught.value.code == "readings.temperature_unit"
 
 
 def part(folder, other, rows):

@@ -21,6 +21,8 @@ from pkmcal.files import (
     validated_document,
     yaml_text,
 )
+from pkmcal.levels import NEGLIGIBLE
+from pkmcal.mechanisms.disturbances import sag, tool_shift
 from pkmcal.mechanisms.document import MechanismDocument
 from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.parameters import ParameterTable
@@ -141,7 +143,28 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
     for name in ("center", "offset", "radius", "arm"):
         value = getattr(checked.tolerance, name)
         check_plausible(value, machine, document.where(*keys, "tolerance", name), "a tolerance")
+    _check_sag(machine, document.where(*keys, "load"))
     return machine
+
+
+def _check_sag(machine: Machine, where: str) -> None:
+    """Raise InputError for a load that shifts the tool at home by more than NEGLIGIBLE of the
+    machine's size: sag is of first order. where : location of the load in its file.
+    """
+    if machine.document.load is None:
+        return
+    home = machine.home()
+    shift = float(np.linalg.norm(tool_shift(machine, home, sag(machine, home))))
+    most = NEGLIGIBLE * machine.size
+    if shift > most:
+        raise InputError(
+            "the drives yield too far under the load",
+            where=where,
+            found=f"{shift:.2g} m at home, by mass, center, gravity and stiffness",
+            expected=f"at most {most:.2g} m, a hundredth of the machine's size",
+            next_step="Write the mass in kg, the center in metres and each stiffness in N/m, of"
+            " cranks in N m/rad: 1 N/um is 1e6 N/m",
+        )
 
 
 def check_plausible(value: float, machine: Machine, where: str, what: str) -> None:
