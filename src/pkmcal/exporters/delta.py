@@ -22,7 +22,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Difference
+from pkmcal.exporters.contract import UNWARNED_ERROR, Difference
 from pkmcal.exporters.limbs import (
     FLOAT_CARRIER,
     SLIDE_CARRIER,
@@ -53,8 +53,8 @@ LEAST_UPRIGHT_PART = 0.8
 """Least vertical component of a tower, or radial component of an arm's plane: within 37 degrees."""
 MM_A_METRE = 1e3
 DEGREES_A_RADIAN = 180 / np.pi
-UNWARNED_TOOL_ERROR = 0.05
-"""Largest tool error without a warning, mm: the repeatability of a good kit."""
+UNWARNED_TOOL_ERROR = MM_A_METRE * UNWARNED_ERROR
+"""Largest tool error without a warning, mm."""
 MOST_TOOL_ERROR = 5.0
 """Largest tool error, mm; beyond it the parameters describe another machine."""
 UNTOLD_SCALE_DIFFERENCE = 1e-9

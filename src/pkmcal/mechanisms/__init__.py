@@ -4,6 +4,7 @@ files.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from importlib import resources
@@ -21,6 +22,7 @@ from pkmcal.files import (
     validated_document,
     yaml_text,
 )
+from pkmcal.geometry.rigid import apply
 from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms.disturbances import sag, tool_shift
 from pkmcal.mechanisms.document import MechanismDocument
@@ -46,6 +48,11 @@ LARGEST_DEVIATION_SHARE = 0.25
 """Largest prior sigma as a share of the machine's size. If two points are each uncertain by more,
 only the order of magnitude of their distance is known; prior sigmas of real machines are a
 hundredth of it at most."""
+
+
+LARGEST_OFFSET_SHARE = 0.25
+"""Largest distance of a universal joint's axes as a share of the leg, up to which the leg's length
+is computed to rounding; that of real joints is a twentieth."""
 
 
 def catalogue() -> dict[str, Path]:
@@ -144,7 +151,29 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
         value = getattr(checked.tolerance, name)
         check_plausible(value, machine, document.where(*keys, "tolerance", name), "a tolerance")
     _check_sag(machine, document.where(*keys, "load"))
+    _check_offsets(machine, lambda leg: document.where(*keys, "legs", leg))
     return machine
+
+
+def _check_offsets(machine: Machine, where: Callable[[int], str]) -> None:
+    """Raise InputError for joints whose axes are apart by more than LARGEST_OFFSET_SHARE of their
+    leg's length at home. where : location of a leg, from 0, in its file.
+    """
+    offsets = machine.layout.offsets
+    if not len(offsets):
+        return
+    b = apply(machine.home(), machine.platform_centers())
+    lengths = np.linalg.norm(b - machine.base_centers(), axis=-1)
+    for leg, each in zip(offsets.leg.tolist(), offsets.offset, strict=True):
+        most, widest = LARGEST_OFFSET_SHARE * lengths[leg], float(np.abs(each).max())
+        if widest > most:
+            raise InputError(
+                f"the axes of a joint of leg {leg + 1} are too far apart for the leg",
+                where=where(leg),
+                found=f"{widest:g} m",
+                expected=f"at most {most:.2g} m, a quarter of the leg at home",
+                next_step="Write the offset in metres, or with its unit, such as 12 mm",
+            )
 
 
 def _check_sag(machine: Machine, where: str) -> None:
