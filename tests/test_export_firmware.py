@@ -217,7 +217,7 @@ def test_only_a_firmware_with_a_print_radius_keeps_one(name, to, tmp_path):
             source = replace(source, machine=replace(source.machine, document=document))
         (redo,) = (one for one in make_export(source, to).notes if one.code == "export.redo")
         assert redo.facts["radius"] == ("90.5" if has and radius else None)
-        assert redo.facts["kept"] == ("print radius" if has and not radius else None)
+        assert redo.facts["limit"] == ("print radius" if has and not radius else None)
 
 
 def switch_lines(text):

@@ -28,7 +28,7 @@ from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.levels import MAJORITY
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.disturbances import compliance, growth_by_readings, sag, tool_shift
-from pkmcal.outcome.finding import Finding, doubtful, note
+from pkmcal.outcome.finding import Finding, Level, note
 from pkmcal.wording import listed
 
 FORMAT_PACKAGES = ("pkmcal.exporters", "pkmcal.firmware")
@@ -184,13 +184,15 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
         poses, joints = samples(machine)
         source = replace(source, machine=machine.with_screws_held())
         change = largest(source.machine.inverse(poses), joints)
-        more.append(_left_out("export.without_screws", change, program=name))
+        more.append(_by_error(note("export.without_screws", program=name, largest=change)))
     if not exporter.holds_effects:
         if len(machine.layout.offsets):
-            poses, joints = samples(machine)
+            poses, joints = samples(source.machine)
             source = replace(source, machine=source.machine.with_meeting_axes(poses))
             change = largest(source.machine.inverse(poses), joints)
-            more.append(_left_out("export.without_joint_offsets", change, program=name))
+            more.append(
+                _by_error(note("export.without_joint_offsets", program=name, largest=change))
+            )
         more += _without_effects(machine, name)
     files = exporter.files(source)
     differences = tuple(exporter.check(files, source))
@@ -215,7 +217,10 @@ def _without_effects(machine: Machine, name: str) -> Iterator[Finding]:
     poses, joints = samples(machine)
     if sags:
         sunk = np.linalg.norm(tool_shift(machine, poses, sag(machine, poses)), axis=-1)
-        yield _left_out("export.without_sag", largest(sunk), program=name, least=float(sunk.min()))
+        least = float(sunk.min())
+        yield _by_error(
+            note("export.without_sag", program=name, largest=largest(sunk), least=least)
+        )
     if growth is not None:
         by = growth_by_readings(machine, joints, poses) @ np.array([growth.drives, growth.frame])
         moved = np.linalg.norm(tool_shift(machine, poses, by), axis=-1)
@@ -227,11 +232,12 @@ def _without_effects(machine: Machine, name: str) -> Iterator[Finding]:
         )
 
 
-def _left_out(code: str, error: float, **facts: Any) -> Finding:
-    """Finding on an effect that a format has not, by its largest error, m; a warning above
+def _by_error(finding: Finding) -> Finding:
+    """Finding on an effect that a format has not, a warning if its largest error is above
     UNWARNED_ERROR.
     """
-    return (note if error <= UNWARNED_ERROR else doubtful)(code, largest=error, **facts)
+    small = finding.facts["largest"] <= UNWARNED_ERROR
+    return finding if small else replace(finding, level=Level.DOUBTFUL)
 
 
 def write_export(made: Export, folder: Path) -> None:

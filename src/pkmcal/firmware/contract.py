@@ -353,9 +353,9 @@ class Firmware(Exporter, ABC):
         if not source.calibrated:
             return notes
         radius = self.print_radius(fit)
-        kept = "print radius" if radius is None and self.has_print_radius(fit) else None
+        limit = "print radius" if radius is None and self.has_print_radius(fit) else None
         bed = "unknown" if source.bed is None else "probed"
-        return (*notes, note("export.redo", radius=radius, kept=kept, bed=bed))
+        return (*notes, note("export.redo", radius=radius, limit=limit, bed=bed))
 
 
 def undetermined_values(values: Sequence[ExportedValue]) -> tuple[Finding, ...]:
