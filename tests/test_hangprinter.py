@@ -126,8 +126,9 @@ METRES = "M669 K6 A0:-1.61:-0.13 B1.29:1.13:-0.15 C-1.41:0.7:-0.12 D0:0:1.9\n"
         (CONFIG.replace("N4", "N5"), "N5"),
         (CONFIG.replace("D18.25:-0.25:2299.5", "D0:0:0"), "0, 0, 0 mm"),
         (CONFIG.replace("Q0.038", "Q-0.05"), "'-0.05'"),
+        (CONFIG.replace("-131.5 ", "-131,5mm "), "'mm'"),
     ],
-    ids=["decimal comma", "metres", "number of anchors", "no line", "build-up"],
+    ids=["decimal comma", "metres", "number of anchors", "no line", "build-up", "unit"],
 )
 def test_the_wrong_value_is_named(tmp_path, text, found):
     with pytest.raises(InputError) as refused:

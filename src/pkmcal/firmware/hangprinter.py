@@ -223,11 +223,7 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
 
     Raises InputError for a configuration without anchors or with values that are no numbers.
     """
-    given: dict[str, tuple[str, str]] = {}
-    for match in _COMMAND.finditer(text):
-        where = f"{label}, line {text.count(chr(10), 0, match.start(1)) + 1}"
-        for letter, values in _WORD.findall(match.group(2)):
-            given[match.group(1) + letter] = values, where
+    given = _stated(text, label)
 
     def numbers(name: str, *sizes: int) -> Array:
         values, where = given[name]
@@ -285,6 +281,26 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
                 expected="0 or more" if letter == "Q" else "above 0",
             )
     return out
+
+
+def _stated(text: str, label: str) -> dict[str, tuple[str, str]]:
+    """Values of M669 and M666 as text, and their places, by command and letter; the last counts.
+
+    Raises InputError for words that are no letter with numbers.
+    """
+    given: dict[str, tuple[str, str]] = {}
+    for match in _COMMAND.finditer(text):
+        where = f"{label}, line {text.count(chr(10), 0, match.start(1)) + 1}"
+        if rest := _WORD.sub("", match.group(2)).split():
+            raise InputError(
+                f"a word of {match.group(1)} is no letter with numbers",
+                where=where,
+                found=quoted(rest[0]),
+                expected="numbers, with colons between those of several axes",
+            )
+        for letter, values in _WORD.findall(match.group(2)):
+            given[match.group(1) + letter] = values, where
+    return given
 
 
 def _model(text: str, label: str) -> NominalModel:
