@@ -203,7 +203,21 @@ def test_points_of_smoothieware_are_the_nozzles_at_contact(tmp_path):
     text = re.sub(r"X(\S+) Y(\S+) Z(\S+)", r"X:\1 Y:\2 Z:\3 A:1.0 B:1.0 C:1.0", text)
     with pytest.raises(InputError) as caught:
         read_measured(text_file(tmp_path, text, "log.txt"), printer)
+    assert caught.value.code == "printer.probe_travel"
     assert "G29.1" in caught.value.next_step
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_repetiers_probing_has_no_heights(own, tmp_path):
+    """A line is how far the probe moved, from a height that it does not contain."""
+    probed = "".join(
+        f"20:41:3{k}.1 : Z-probe:1{k}.123 X:{k}.00 Y:0.00 zCorr:0.000\n" for k in range(8)
+    )
+    path = text_file(tmp_path, REPETIER + probed if own else REPETIER)
+    log = None if own else text_file(tmp_path, probed, "log.txt")
+    with pytest.raises(InputError) as caught:
+        printer_session_texts(path, log)
+    assert caught.value.code == "printer.probe_travel"
 
 
 @pytest.mark.parametrize(("off", "reported"), [(0.5, False), (16.0, True), (-4.0, True)])
@@ -288,3 +302,34 @@ def test_expressions_of_reprapfirmware_are_refused_with_what_to_write(line, tmp_
         read_printer(tmp_path / "config.g")
     assert "line 4" in caught.value.where
     assert f"Send {line.split()[0]} " in caught.value.next_step
+
+
+REPRAP = "M665 L270.5:270.5:270.5 R105.5 H300.5 B90 X0.2 Y-0.1 Z0.3\nM666 X-0.25 Y0 Z-1.5 A0 B0\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("config.g", changed(REPRAP, "R105.5", "R105,5"), 1),
+        ("config.g", changed(REPRAP, "X-0.25", "X"), 2),
+        ("config.g", changed(REPRAP, "Z-1.5", "Znan"), 2),
+        ("config.g", REPRAP + "M92 X80 Y80 Z8e1\n", 3),
+        ("config.g", REPRAP + "M92 X80 Y80 Z0\n", 3),
+        ("eeprom.txt", changed(REPETIER, "EPR:1 893 20", "EPR:1 893 "), 6),
+        ("eeprom.txt", changed(REPETIER, "EPR:1 893 20", "EPR:1 8 93  20"), None),
+        ("eeprom.txt", changed(REPETIER, "EPR:3 941 0.400", "EPR:3 941"), 15),
+    ],
+)
+def test_a_damaged_value_is_no_default(name, text, line, tmp_path):
+    """A value whose text is damaged is neither cut nor left at its default."""
+    with pytest.raises(InputError) as caught:
+        read_printer(text_file(tmp_path, text, name))
+    assert caught.value.where == (name if line is None else f"{name}, line {line}")
+
+
+def test_printers_in_metres_are_refused(tmp_path):
+    text = re.sub(
+        r"\d+\.\d+(?=[^\n]*mm\])", lambda number: f"{float(number[0]) / 1e3:.6f}", REPETIER
+    )
+    with pytest.raises(InputError, match="in mm"):
+        read_printer(text_file(tmp_path, text))

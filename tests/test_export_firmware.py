@@ -195,7 +195,29 @@ def test_the_print_radius_is_the_printers_own(tmp_path):
     assert klipper_config(text).getfloat("printer", "print_radius") == 90.5
     made = make_export(source, "reprap")
     assert reprap.read_words(made.files["pkmcal_delta.g"])["665B"].tolist() == [90.5]
-    assert "The print radius stays 90.5 mm." in made.notes[-1].text
+    assert made.notes[-1].facts["radius"] == "90.5"
+
+
+@pytest.mark.parametrize(
+    ("to", "name"),
+    [
+        *((one.name, "linear-delta") for one in firmwares()),
+        ("klipper", "delta"),
+        ("reprap", "delta"),
+    ],
+)
+def test_only_a_firmware_with_a_print_radius_keeps_one(name, to, tmp_path):
+    has = to != "smoothie" and (to, name) != ("klipper", "delta")
+    for radius, folder in ((0.0905, "stated"), (None, "unstated")):
+        machine = with_radius(built(name), radius) if radius else built(name)
+        (tmp_path / folder).mkdir()
+        source = load_source(calibration(tmp_path / folder, machine))
+        if to == "repetier":
+            document = machine.document.model_copy(update={"steps_per_mm": (80.0, 80.0, 80.0)})
+            source = replace(source, machine=replace(source.machine, document=document))
+        (redo,) = (one for one in make_export(source, to).notes if one.code == "export.redo")
+        assert redo.facts["radius"] == ("90.5" if has and radius else None)
+        assert redo.facts["limit"] == ("print radius" if has and not radius else None)
 
 
 def switch_lines(text):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from copy import deepcopy
 from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
 
 import numpy as np
@@ -351,6 +352,13 @@ REFUSED = {
     "no direction": (lambda: changed(mjcf, ".//joint[@name='slide0']", axis="0 0 0"), "0.0"),
     "no such site": (lambda: changed(mjcf, "equality/connect", site2="nowhere"), "nowhere"),
     "a type of joint": (lambda: changed(sdf, ".//joint", type="screw"), "screw"),
+    "two joints of one name": (
+        lambda: changed(mjcf, ".//joint[@name='slide0']", name="slide1"), "slide1"
+    ),
+    "two sites of one name": (lambda: changed(mjcf, ".//site[@name='tip0']", name="tip1"), "tip1"),
+    "two links of one name": (
+        lambda: changed(sdf, ".//link[@name='tube0']", name="tube1"), "tube1"
+    ),
     "no such link": (lambda: with_text(sdf, ".//joint/parent", "nobody"), "nobody"),
 }  # fmt: skip
 
@@ -362,6 +370,36 @@ def test_what_cannot_be_represented_is_refused_with_what_was_read(what, tmp_path
         read(written(make(), tmp_path), tmp_path)
     assert fact in error.value.found
     assert error.value.where.startswith("model.xml")
+
+
+@pytest.mark.parametrize(("gear", "scale"), [("1", 1.0), ("1.25", 0.8), ("90", 1.0), ("-1", 1.0)])
+def test_a_gear_that_is_no_scale_is_stated(gear, scale, tmp_path):
+    """Readings are then the joints' values, not the drives' positions."""
+    root = mjcf()
+    for motor in root.findall("actuator/motor"):
+        motor.tag = "position"
+        motor.set("gear", gear)
+    machine, text = read(written(root, tmp_path), tmp_path)
+    assert machine.to_document()["legs"][0]["scale"] == pytest.approx(scale)
+    assert (sum("gears" in line for line in text.splitlines()) > 0) == (gear in ("90", "-1"))
+
+
+@pytest.mark.parametrize("what", ["a link", "a joint", "a second parent"])
+def test_a_urdf_is_a_tree_of_names(what, tmp_path):
+    """Elements that would replace others are refused, not dropped."""
+    files = exporters()["urdf"].files(MachineSource(machine_of("gough-stewart")))
+    tree, loops = files
+    root = fromstring(files[tree])
+    tag = "link" if what == "a link" else "joint"
+    node = deepcopy(root.findall(tag)[-1])
+    if what == "a second parent":
+        node.set("name", "another")
+    root.append(node)
+    (tmp_path / loops).write_text(files[loops])
+    with pytest.raises(InputError) as error:
+        read(written(root, tmp_path, tree), tmp_path)
+    child = node.get("name") if what != "a second parent" else node.find("child").get("link")
+    assert error.value.found == child
 
 
 def test_a_model_without_loops_is_refused(tmp_path):

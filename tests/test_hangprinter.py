@@ -103,7 +103,7 @@ def test_lines_without_spools_are_read_as_positions(tmp_path):
     "text",
     [
         "M669 K6\n",
-        CONFIG.replace("C-1415.75:707.5:-121.75", ""),
+        CONFIG.replace(" N4", "").replace("C-1415.75:707.5:-121.75", ""),
         CONFIG.replace("C-1415.75:707.5:-121.75", "C-1415.75:707.5"),
         CONFIG.replace("R75.1:74.9:75.2:75.05", "R75.1:74.9"),
         CONFIG.replace("R75.1", "R-75.1"),
@@ -120,8 +120,15 @@ METRES = "M669 K6 A0:-1.61:-0.13 B1.29:1.13:-0.15 C-1.41:0.7:-0.12 D0:0:1.9\n"
 
 @pytest.mark.parametrize(
     ("text", "found"),
-    [(CONFIG.replace("R75.1:", "R75,1:"), "'75,1:"), (METRES, "1.9 mm")],
-    ids=["decimal comma", "metres"],
+    [
+        (CONFIG.replace("R75.1:", "R75,1:"), "'75,1:"),
+        (METRES, "1.9"),
+        (CONFIG.replace("N4", "N5"), "N5"),
+        (CONFIG.replace("D18.25:-0.25:2299.5", "D0:0:0"), "0, 0, 0 mm"),
+        (CONFIG.replace("Q0.038", "Q-0.05"), "'-0.05'"),
+        (CONFIG.replace("-131.5 ", "-131,5mm "), "'mm'"),
+    ],
+    ids=["decimal comma", "metres", "number of anchors", "no line", "build-up", "unit"],
 )
 def test_the_wrong_value_is_named(tmp_path, text, found):
     with pytest.raises(InputError) as refused:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -122,9 +124,11 @@ WRONG = {
     ROTARY.replace("lower_arm_length: 320", "lower_arm_length: 20"): "do not reach",
     ROTARY.replace("position_endstop: 250", "position_endstop: 2500"): "do not reach",
     ROTARY.replace("position_endstop: 250", "position_endstop: -10"): "do not reach",
-    WINCH.replace("anchor_z: 3000", "anchor_z: 60000"): "too far",
-    WINCH.replace("anchor_z: 3000", "anchor_z: 0"): "no length at home",
+    WINCH.replace("anchor_z: 3000", "anchor_z: 60000"): "no lengths of a machine in mm",
+    WINCH.replace("anchor_z: 3000", "anchor_z: 0"): "no length with the tool in the origin",
     WINCH.replace("anchor_z: 3000", ""): "missing: anchor_z",
+    re.sub(r"(_(?:radius|height|length|endstop): )(\d+)", r"\g<1>0.\2", ROTARY): "in mm",
+    re.sub(r"shoulder_height: \d+", "shoulder_height: 4", ROTARY): "do not reach the platform",
     WINCH.partition("[stepper_d]")[0].replace("anchor_z: -100", "anchor_z: 0"): "singular",
 }
 

@@ -16,6 +16,7 @@ from pkmcal.files import yaml_text
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.outcome.finding import Level
 from screw_hexapod import screw_hexapod
 from test_kinematics import differences
 from test_pose_sessions import make, write_joints
@@ -129,6 +130,7 @@ def test_a_format_with_one_centre_is_noted(to, noted, tmp_path):
     for note in notes:
         # less than the offsets, for the rods' offsets take their mean
         assert 1e-5 < note.facts["largest"] < 2e-3
+        assert note.level is Level.DOUBTFUL
 
 
 def test_calibration_knows_the_offsets(tmp_path):
@@ -156,6 +158,7 @@ def test_calibration_knows_the_offsets(tmp_path):
     [
         (lambda leg: leg["base"].pop("axis"), "legs[2].base.offset"),
         (lambda leg: leg["length"].update(lead=0.005), "legs[2].length.lead"),
+        (lambda leg: leg["base"].update(offset=0.3), "legs[2]"),  # half of the leg
         (lambda leg: leg.update(tubes=[{"radius": 0.01, "from": 0.1, "to": 0.2}]), "legs[2].tubes"),
     ],
 )

@@ -21,6 +21,7 @@ from pkmcal.judge.validate import validate_calibration
 from pkmcal.judge.watch import watch_machine
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.disturbances import sag, weight_on_readings
+from pkmcal.outcome.finding import Level
 from pkmcal.report.calibration import save
 from pkmcal.simulation import load_truth
 from test_pose_sessions import make, write_joints
@@ -167,6 +168,7 @@ def test_the_estimate_is_as_sure_as_it_states(tmp_path):
     ("change", "field"),
     [
         (lambda d: d["legs"][2].pop("stiffness"), "legs[3].stiffness"),
+        (lambda d: [leg.update(stiffness=200.0) for leg in d["legs"]], "load"),  # N/um
         (lambda d: d.pop("load"), "load"),
     ],
 )
@@ -202,3 +204,22 @@ def test_an_export_leaves_the_sag_out(to, noted, tmp_path):
         sunk = machine.forward(joints + sag(machine, poses), poses) - poses
         largest = np.linalg.norm(sunk[:, :3, 3], axis=1).max()
         assert note.facts["largest"] == pytest.approx(largest, rel=1e-2)
+        assert note.level is Level.DOUBTFUL
+
+
+def test_a_sag_that_hardly_counts_is_no_warning(tmp_path):
+    made = make_export(source_of(load_mechanism(loaded(tmp_path, stiffness=1e8))), "c")
+    (note,) = (one for one in made.notes if one.code == SAG_NOTE)
+    assert (note.level, note.facts["largest"] < 5e-5) == (Level.NOTE, True)
+
+
+def test_a_compliance_is_positive(tmp_path):
+    """Drives that rise under the load, as with gravity in the wrong direction: nothing named sag,
+    and no result where the file states a stiffness.
+    """
+    unstated = calibrate_session(sagging(tmp_path / "unstated", -STIFFNESS, None))
+    assert "machine.sag" not in {one.code for one in unstated.violations}
+    stated = calibrate_session(sagging(tmp_path / "stated", -STIFFNESS, STIFFNESS))
+    assert not stated.verdict.usable
+    (one,) = stated.verdict.of("machine.compliance_negative")
+    assert one.facts["value"] == pytest.approx(-1, abs=0.1)

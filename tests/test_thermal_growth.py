@@ -10,9 +10,11 @@ import pytest
 import pkmcal
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.saved_calibration import load
-from pkmcal.files import csv_text
+from pkmcal.errors import InputError
+from pkmcal.files import csv_text, yaml_text
 from pkmcal.judge.validate import validate_calibration
 from pkmcal.judge.watch import watch_machine
+from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.disturbances import growth_by_readings
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
@@ -73,12 +75,20 @@ def test_growth_is_estimated(name, tmp_path):
 
 @pytest.mark.parametrize("head", ["temperature", "temperature [K]", "temperature (°C)"])
 def test_temperatures_are_the_last_column(head, tmp_path):
-    made = warmed(tmp_path / "session", 0.0, 0.0, head=head)
+    T = 35 - 15 * np.cos(np.linspace(0, 2 * np.pi, 40)) + 273.15 * ("K" in head)
+    made = warmed(tmp_path / "session", 0.0, 0.0, head=head, T=T)
     session = load_session(made.folder)
     assert session.joints.shape == (40, 6)
     assert np.ptp(session.temperature) == pytest.approx(30, abs=0.1)
-    celsius = 35 - 273.15 * ("K" in head)
-    assert session.temperature.mean() == pytest.approx(celsius, abs=0.5)
+    assert session.temperature.mean() == pytest.approx(35, abs=0.5)
+
+
+@pytest.mark.parametrize(("head", "shift"), [("temperature", 273.15), ("temperature [K]", -20.0)])
+def test_temperatures_in_another_unit_than_their_head(head, shift, tmp_path):
+    made = warmed(tmp_path / "session", 0.0, 0.0, head=head, T=np.linspace(20, 21, 10) + shift)
+    with pytest.raises(InputError) as caught:
+        load_session(made.folder)
+    assert caught.value.code == "readings.temperature_unit"
 
 
 def part(folder, other, rows):
@@ -159,3 +169,38 @@ def test_simulated_sessions_warm(tmp_path):
     grown = by @ effects.growth * (T - T.mean())[:, None]
     assert np.max(np.abs(grown)) > 2e-5
     np.testing.assert_allclose(cold.joints - warm.joints, grown, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "delta"])
+def test_a_difference_between_two_temperatures(name, tmp_path):
+    """A machine that grows evenly becomes a similar one: the tool moves along with the frame."""
+    fields, paths = load_mechanism(name).to_document(), {}
+    for temperature in (20, 60):
+        fields["growth"] = {
+            "temperature": temperature, "drives": 1e-5, "frame": 1e-5, "sigma": [1e-12, 1e-12],
+        }  # fmt: skip
+        paths[temperature] = tmp_path / f"{temperature}.yaml"
+        paths[temperature].write_text(yaml_text(fields), encoding="utf-8")
+    result = pkmcal.diff(paths[20], paths[60])
+    (found,) = result.verdict.of("difference.temperature")
+    facts = found.facts
+    assert (facts["temperature_a"], facts["temperature_b"]) == (20, 60)
+    places = result.tool.evenly[1].T_base_platform[:, :3, 3]
+    moved = 40 * 1e-5 * np.sqrt(np.mean(np.sum(places**2, axis=1)))
+    assert facts["tool_shift"] == pytest.approx(moved, rel=1e-3)
+    assert not pkmcal.diff(paths[20], paths[20]).verdict.findings
+
+
+def test_calibrations_at_two_temperatures(tmp_path):
+    """The growth of 95 K is more than chance; that of 2 K is not."""
+    T = np.concatenate([35 - 15 * np.cos(np.linspace(0, 2 * np.pi, 40)), np.linspace(120, 140, 40)])
+    whole = warmed(tmp_path / "whole", DRIVES, FRAME, name="hexaglide", T=T).folder
+    for part_of, rows in (("a", slice(0, 40)), ("b", slice(40, 80)), ("c", slice(2, 40))):
+        session = part(tmp_path / f"session-{part_of}", whole, rows)
+        save(calibrate_session(session), tmp_path / part_of)
+    a, b, c = (tmp_path / name for name in "abc")
+    (found,) = pkmcal.diff(a, b).verdict.of("difference.temperature")
+    warmer = found.facts["temperature_b"] - found.facts["temperature_a"]
+    assert warmer == pytest.approx(95, abs=1)
+    assert found.facts["tool_shift"] > found.facts["sigma"] > 0
+    assert not pkmcal.diff(a, c).verdict.of("difference.temperature")

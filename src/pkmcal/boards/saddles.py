@@ -25,10 +25,18 @@ RING = np.array([
 
 @dataclass(frozen=True)
 class SaddleOptions:
-    """Constants of the search for blocks of chessboard corners."""
+    """Constants of the search for blocks of chessboard corners.
+
+    None is critical within a factor of two (of the angle for cosines, of the logarithm for a ratio;
+    one for a count of diagonals), measured with each changed by itself on new images: 72 of
+    chessboards (12 of three seeds of rendered machines, 60 of random views by a pinhole camera and
+    a fisheye lens) and 72 without one (12 of these machines, 60 of random grids of windows). All
+    chessboards are large enough with all values but a ``growth`` of 0.3, which loses one; of images
+    without, two are, none with that growth, and four with a ``least_contrast`` of 3.
+    """
 
     # least side of an image, px, of which the half is searched too: in a smaller one, windows of a
-    # facade alternate as squares do (measured)
+    # facade alternate as squares do
     least_side: int = 300
     # least difference between light and dark quadrants, grey levels
     least_contrast: float = 6.0

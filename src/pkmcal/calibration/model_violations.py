@@ -539,7 +539,9 @@ def _sag(
             "stiffness": 1 / value[0] if value[0] > 0 else None,
         }
 
-    yield Column("machine.sag", "drives", "sag under the load", readings=by, facts=facts)
+    yield Column(
+        "machine.sag", "drives", "sag under the load", readings=by, facts=facts, positive=True
+    )
 
 
 def _joint_offsets(

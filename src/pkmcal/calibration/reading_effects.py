@@ -31,7 +31,7 @@ from pkmcal.mechanisms.disturbances import (
     tool_shift,
 )
 from pkmcal.mechanisms.document import STEEL_EXPANSION, STIFFNESS_TOLERANCE, Growth
-from pkmcal.outcome.finding import Finding, note
+from pkmcal.outcome.finding import Finding, note, wrong
 from pkmcal.session.load import Session
 
 THERMAL_GROWTH, COMPLIANCE = "readings.growth", "machine.compliance"
@@ -89,13 +89,12 @@ def reading_effects(
     if temperature is not None:
         growth = growth_of(machine, temperature)
         warmer = (temperature - growth.temperature)[:, None, None]
-        mutual = np.array([[1.0, growth.correlation], [growth.correlation, 1.0]])
         out.append(
             ReadingEffect(
                 THERMAL_GROWTH,
                 warmer * growth_by_readings(machine, joints, poses),
                 np.array([growth.drives, growth.frame]),
-                np.diag(growth.sigma) @ np.linalg.cholesky(mutual),
+                growth.root,
             )
         )
     return tuple(out)
@@ -141,7 +140,7 @@ def with_estimated_effects(session: Session, estimate: Estimate) -> Estimate:
 
 
 def effect_notes(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """Notes on the estimated coefficients."""
+    """Notes on the estimated coefficients, and a reason against a negative compliance."""
     document, used = session.machine.document, estimate.configurations
     for effect in effects_of_session(session):
         value, covariance = effect.estimated(estimate)
@@ -149,14 +148,17 @@ def effect_notes(session: Session, estimate: Estimate) -> Iterator[Finding]:
         if effect.code == COMPLIANCE and document.load is not None:
             poses = estimate.state.T_base_platform[used]
             shift = tool_shift(estimate.machine, poses, value[0] * sag(session.machine, poses))
-            yield note(
-                "machine.compliance",
-                value=float(value[0]),
-                sigma=float(sigma[0]),
-                prior=float(effect.root[0, 0]),
-                mass=document.load.mass,
-                tool_shift=float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1)))),
-            )
+            facts = {
+                "value": float(value[0]),
+                "sigma": float(sigma[0]),
+                "prior": float(effect.root[0, 0]),
+                "mass": document.load.mass,
+                "tool_shift": float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1)))),
+            }
+            if value[0] > 0:
+                yield note("machine.compliance", **facts)
+            else:  # no drive yields against its force, and no mechanism file can state that
+                yield wrong("machine.compliance_negative", **facts)
         if effect.code == THERMAL_GROWTH and session.temperature is not None:
             yield note(
                 "readings.growth",

@@ -28,11 +28,15 @@ from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.levels import MAJORITY
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.disturbances import compliance, growth_by_readings, sag, tool_shift
-from pkmcal.outcome.finding import Finding, note
+from pkmcal.outcome.finding import Finding, Level, note
 from pkmcal.wording import listed
 
 FORMAT_PACKAGES = ("pkmcal.exporters", "pkmcal.firmware")
 """Folders of plug-ins, each module of which may define a format."""
+
+UNWARNED_ERROR = 5e-5
+"""Largest error of the tool or of a reading without a warning, m: the repeatability of a good kit.
+"""
 
 
 @dataclass(frozen=True)
@@ -180,13 +184,15 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
         poses, joints = samples(machine)
         source = replace(source, machine=machine.with_screws_held())
         change = largest(source.machine.inverse(poses), joints)
-        more.append(note("export.without_screws", program=name, largest=change))
+        more.append(_by_error(note("export.without_screws", program=name, largest=change)))
     if not exporter.holds_effects:
         if len(machine.layout.offsets):
-            poses, joints = samples(machine)
+            poses, joints = samples(source.machine)
             source = replace(source, machine=source.machine.with_meeting_axes(poses))
             change = largest(source.machine.inverse(poses), joints)
-            more.append(note("export.without_joint_offsets", program=name, largest=change))
+            more.append(
+                _by_error(note("export.without_joint_offsets", program=name, largest=change))
+            )
         more += _without_effects(machine, name)
     files = exporter.files(source)
     differences = tuple(exporter.check(files, source))
@@ -211,8 +217,9 @@ def _without_effects(machine: Machine, name: str) -> Iterator[Finding]:
     poses, joints = samples(machine)
     if sags:
         sunk = np.linalg.norm(tool_shift(machine, poses, sag(machine, poses)), axis=-1)
-        yield note(
-            "export.without_sag", program=name, largest=largest(sunk), least=float(sunk.min())
+        least = float(sunk.min())
+        yield _by_error(
+            note("export.without_sag", program=name, largest=largest(sunk), least=least)
         )
     if growth is not None:
         by = growth_by_readings(machine, joints, poses) @ np.array([growth.drives, growth.frame])
@@ -223,6 +230,14 @@ def _without_effects(machine: Machine, name: str) -> Iterator[Finding]:
             temperature=growth.temperature,
             per_kelvin=largest(moved),
         )
+
+
+def _by_error(finding: Finding) -> Finding:
+    """Finding on an effect that a format has not, a warning if its largest error is above
+    UNWARNED_ERROR.
+    """
+    small = finding.facts["largest"] <= UNWARNED_ERROR
+    return finding if small else replace(finding, level=Level.DOUBTFUL)
 
 
 def write_export(made: Export, folder: Path) -> None:

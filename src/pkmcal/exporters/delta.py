@@ -22,7 +22,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Difference
+from pkmcal.exporters.contract import UNWARNED_ERROR, Difference
 from pkmcal.exporters.limbs import (
     FLOAT_CARRIER,
     SLIDE_CARRIER,
@@ -53,8 +53,8 @@ LEAST_UPRIGHT_PART = 0.8
 """Least vertical component of a tower, or radial component of an arm's plane: within 37 degrees."""
 MM_A_METRE = 1e3
 DEGREES_A_RADIAN = 180 / np.pi
-UNWARNED_TOOL_ERROR = 0.05
-"""Largest tool error without a warning, mm: the repeatability of a good kit."""
+UNWARNED_TOOL_ERROR = MM_A_METRE * UNWARNED_ERROR
+"""Largest tool error without a warning, mm."""
 MOST_TOOL_ERROR = 5.0
 """Largest tool error, mm; beyond it the parameters describe another machine."""
 UNTOLD_SCALE_DIFFERENCE = 1e-9
@@ -782,11 +782,3 @@ def firmware_tool_difference(
         # the fit's error is of first order, so a large one may be 2 % larger
         1.02 * stated_error + TOOL_ROUNDING + MOST_AMPLIFICATION * end_rounding / MM_A_METRE,
     )
-
-
-def redo(source: MachineSource) -> tuple[Finding, ...]:
-    """Measurements to repeat with these values in a firmware; none for a nominal model."""
-    if not source.calibrated:
-        return ()
-    bed = "unknown" if source.bed is None else "probed"
-    return (note("export.redo", radius=workspace_radius(source.machine), bed=bed),)

@@ -14,6 +14,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
+from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError, PkmcalError, legible
 from pkmcal.exporters.leg_fit import GEOMETRY_SHARE, Chain, LegFit, list_text
 from pkmcal.exporters.mujoco_read import read_mujoco
@@ -42,6 +43,10 @@ COMPARED_POSES = 8
 DRAWN_TUBES = (
     "The legs' tubes are the cylinders that the file draws along them, at home: measure their"
     " radii."
+)
+GEARED = (
+    "Readings of {joints} are the joints' values; the gears that the file has between these and"
+    " the drives' positions are not in them."
 )
 LEAST_SCALE, MOST_SCALE = 0.5, 2.0
 """Bounds of the ratio of a joint's value and its reading; beyond them it is a gear of something
@@ -123,6 +128,7 @@ def _read(path: Path, text: str) -> tuple[ReadModel, str]:
 
 def _nominal(model: ReadModel, form: str, path: Path, tube: float | None) -> NominalModel:
     """Nominal model of a model that was read."""
+    geared = model.actuated[~_is_scale(model.gear)]
     names = [body.name for body in model.bodies]
     if doubled := [name for name in names if names.count(name) > 1]:
         raise InputError("two bodies have one name", found=doubled[0])
@@ -153,14 +159,14 @@ def _nominal(model: ReadModel, form: str, path: Path, tube: float | None) -> Nom
         for number, chain in enumerate((c for c in chains if c not in guides), 1)
     ]
     fits.sort(key=lambda fit: fit.column if fit.column >= 0 else len(model.actuated) + fit.number)
+    joints = {j.dof: j.name for body in model.bodies for j in body.joints}
     unused = set(range(parts.model.actuated.size)) - {fit.column for fit in fits}
     if unused or not fits:
-        names = {j.dof: j.name for body in model.bodies for j in body.joints}
         raise InputError(
             "a motor moves a joint that is no leg's"
             if fits
             else "there are no legs between base and platform",
-            found=listed([names[int(parts.model.actuated[k])] for k in unused]) or None,
+            found=listed([joints[int(parts.model.actuated[k])] for k in unused]) or None,
             expected="the slide along a leg, or a hinge or slide between base and leg",
         )
     columns = [fit.column for fit in fits]
@@ -177,6 +183,11 @@ def _nominal(model: ReadModel, form: str, path: Path, tube: float | None) -> Nom
             " and joints, in its frame, m and rad. The format has no ties between parameters.",
             *((DRAWN_TUBES,) if tube is None and any(leg.tubes for leg in legs) else ()),
             *((f"Joints in no loop, held at home: {legible(listed(tool, 8))}.",) if tool else ()),
+            *(
+                (GEARED.format(joints=legible(listed([joints[k] for k in geared], 8))),)
+                if geared.size
+                else ()
+            ),
         ),
         (),
         motion,
@@ -264,12 +275,17 @@ def _frame_body(parts: RigidBodies, platform: int) -> int:
     return (named or own)[0]
 
 
+def _is_scale(gear: Array) -> Booleans:
+    """Whether gears (m,) are scales of readings; others are those of a drive."""
+    return (gear > 1 / MOST_SCALE) & (gear < 1 / LEAST_SCALE)
+
+
 def _with_readings(parts: RigidBodies, platform: int) -> RigidBodies:
     """Parts with readings: the file's motors, or without any the legs' slides, or the first hinges
     or slides on the base.
     """
     model = parts.model
-    gear = np.where((model.gear > 1 / MOST_SCALE) & (model.gear < 1 / LEAST_SCALE), model.gear, 1.0)
+    gear = np.where(_is_scale(model.gear), model.gear, 1.0)
     if model.actuated.size:
         return replace(parts, model=replace(model, gear=gear))
     chains = _chains(parts, {0}, {platform, *_bars(parts, platform)})

@@ -232,7 +232,6 @@ class LegFit:
         if motor.kind == "slide":
             center = self.a - float(self.parts.x[motor.dof]) * motor.axis
             place = f"center: {list_text(center)}, axis: {list_text(motor.axis)}"
-            place = f"center: {list_text(center)}, axis: {list_text(motor.axis)}"
             return f"{{joint: slider, {place}{ends}}}"
         along, arm = self.arm(motor)
         length, center = float(np.linalg.norm(arm)), motor.point

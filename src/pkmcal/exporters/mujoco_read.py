@@ -31,6 +31,7 @@ from pkmcal.exporters.xml_read import (
     LARGEST_MODEL_FILE,
     MOST_ELEMENTS,
     attribute,
+    by_name,
     check_size,
     refused,
     unit_axis,
@@ -65,6 +66,8 @@ def read_mujoco(text: str, folder: Path | None = None) -> ReadModel:
     for name in UNREAD_ELEMENTS:
         if (node := root.find(f".//{name}")) is not None:
             raise refused(node, f"<{name}> is not read", expected="bodies that are written out")
+    for tags in (("joint", "freejoint"), ("site",)):
+        by_name(node for tag in tags for node in root.findall(f"worldbody//{tag}[@name]"))
     _fill_defaults(root)
     tree = _Bodies(_units(root))
     for world in root.findall("worldbody"):
@@ -343,10 +346,7 @@ class _Bodies:
             return rotation(self.units[0] * angle * unit_axis(node, np.array(axis)))
         if "euler" in node.attrib:
             return self._euler(vector(node, "euler", ""))
-        quaternion = vector(node, "quat", "1 0 0 0", 4)
-        if not np.any(quaternion):
-            raise refused(node, "a quaternion of zeros is no orientation")
-        return from_quaternion(quaternion / np.linalg.norm(quaternion))
+        return _rotation_of(node, vector(node, "quat", "1 0 0 0", 4))
 
     def _euler(self, angles: Array) -> Array:
         """Orientation (3, 3) of Euler angles (3,) in the file's unit."""
@@ -356,6 +356,13 @@ class _Bodies:
             # lower-case axes turn with the body, capital ones are fixed
             out = out @ turn if axis.islower() else turn @ out
         return out
+
+
+def _rotation_of(node: Element, quaternion: Array) -> Array:
+    """Rotation (3, 3) of a quaternion (4,) of any length but zero."""
+    if not np.any(quaternion):
+        raise refused(node, "a quaternion of zeros is no orientation")
+    return from_quaternion(quaternion / np.linalg.norm(quaternion))
 
 
 def _drives(root: Element, joints: dict[str, ReadJoint]) -> list[Element]:
@@ -428,7 +435,7 @@ def _of_qpos(bodies: Sequence[ReadBody], drawn: Array, key: Element) -> Array:
     x, at = drawn.copy(), 0
     for body, j in joints:
         if j.kind == "free":
-            here = pose(from_quaternion(qpos[at + 3 : at + 7]), qpos[at : at + 3])
+            here = pose(_rotation_of(key, qpos[at + 3 : at + 7]), qpos[at : at + 3])
             x[j.dof : j.dof + 6] = pose_difference(here, body.T_parent_body)
             at += 7
         else:

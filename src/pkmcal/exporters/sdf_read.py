@@ -19,6 +19,7 @@ from pkmcal.exporters.read_model import (
 )
 from pkmcal.exporters.xml_read import (
     attribute,
+    by_name,
     label_of,
     limits_of,
     numbers,
@@ -119,9 +120,9 @@ class _Links:
 
     def __init__(self, model: Element, version: tuple[int, ...]) -> None:
         self.version = version
-        self.links = _named(model, "link")
-        self.frames = _named(model, "frame")
-        self.joints = _named(model, "joint")
+        self.links = by_name(model.findall("link"))
+        self.frames = by_name(model.findall("frame"))
+        self.joints = by_name(model.findall("joint"))
         self.readings = {
             attribute(node, "joint"): {
                 key: str(numbers(node, attribute(node, key), (1,), key)[0])
@@ -282,11 +283,6 @@ class _Links:
         if out:
             self.joints_by_name[name] = out[0]
         return tuple(out)
-
-
-def _named(model: Element, tag: str) -> dict[str, Element]:
-    """Elements of a tag by name."""
-    return {attribute(node, "name"): node for node in model.findall(tag)}
 
 
 def _ratio_and_offset(mimic: Element) -> tuple[float, float]:

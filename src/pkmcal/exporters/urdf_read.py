@@ -25,6 +25,7 @@ from pkmcal.exporters.read_model import (
 )
 from pkmcal.exporters.xml_read import (
     attribute,
+    by_name,
     limits_of,
     numbers,
     refused,
@@ -114,8 +115,12 @@ class _Tree:
 
     def __init__(self, root: Element, loops_name: str) -> None:
         self.loops_name = loops_name
-        self.links = {attribute(node, "name"): node for node in root.findall("link")}
-        self.above = {self._end(node, "child"): node for node in root.findall("joint")}
+        self.links = by_name(root.findall("link"))
+        self.above: dict[str, Element] = {}
+        for node in by_name(root.findall("joint")).values():
+            if self._end(node, "child") in self.above:
+                raise refused(node, "a link has two joints above it", self._end(node, "child"))
+            self.above[self._end(node, "child")] = node
         self.bodies: list[ReadBody] = []
         self.numbers: dict[str, int] = {}
         self.joints: dict[str, ReadJoint] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 import numpy as np
@@ -77,6 +78,16 @@ def attribute(node: Element, key: str) -> str:
     if key not in node.attrib:
         raise refused(node, f"the element has no {key}", expected=f'{key}="…"')
     return node.attrib[key]
+
+
+def by_name(nodes: Iterable[Element]) -> dict[str, Element]:
+    """Elements by their names. Raises InputError for one without a name, and for two of one."""
+    out: dict[str, Element] = {}
+    for node in nodes:
+        if attribute(node, "name") in out:
+            raise refused(node, "two elements have one name", node.attrib["name"])
+        out[node.attrib["name"]] = node
+    return out
 
 
 def numbers(

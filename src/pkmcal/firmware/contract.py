@@ -37,13 +37,13 @@ from pkmcal.exporters.delta import (
     firmware_tool_difference,
     fit_of,
     readings_elsewhere,
-    redo,
     switch_values,
     value_sigmas,
     workspace_radius,
 )
 from pkmcal.files import closest, quoted, read_text
-from pkmcal.outcome.finding import Finding, doubtful
+from pkmcal.firmware.cables import check_millimetres
+from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.wording import listed
 
 CARRIAGE_STEP = 1 / 80
@@ -251,9 +251,14 @@ class Firmware(Exporter, ABC):
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values of an exported text."""
 
+    def has_print_radius(self, fit: Fit) -> bool:
+        """Whether the firmware limits a delta of this kind to a print radius."""
+        del fit
+        return True
+
     def print_radius(self, fit: Fit) -> str | None:
         """Print radius of the exported file, mm, as written; None without one."""
-        return workspace_radius(fit.delta.machine)
+        return workspace_radius(fit.delta.machine) if self.has_print_radius(fit) else None
 
     def steps(self, fit: Fit) -> Array | None:
         """Motor steps per mm (3,) of the exported file; None without any."""
@@ -341,10 +346,16 @@ class Firmware(Exporter, ABC):
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """Values that the data left to the nominal model, agreement of settings and machine, and
-        the steps after installing them.
+        the steps after installing the values of a calibration.
         """
-        undetermined = undetermined_values(self.values(source))
-        return (*undetermined, self.fit(source).following, *redo(source))
+        fit = self.fit(source)
+        notes = (*undetermined_values(self.values(source)), fit.following)
+        if not source.calibrated:
+            return notes
+        radius = self.print_radius(fit)
+        limit = "print radius" if radius is None and self.has_print_radius(fit) else None
+        bed = "unknown" if source.bed is None else "probed"
+        return (*notes, note("export.redo", radius=radius, limit=limit, bed=bed))
 
 
 def undetermined_values(values: Sequence[ExportedValue]) -> tuple[Finding, ...]:
@@ -365,6 +376,7 @@ def firmwares() -> list[Firmware]:
 
 def buildable_delta(printer: Printer) -> Printer:
     """The printer, unchanged. Raises InputError if no delta with these values can be built."""
+    check_millimetres(float(printer.rod.max()), printer.label)
     if not 0 < printer.radius < printer.rod.min():
         raise InputError(
             "a rod has to be longer than the delta radius",
@@ -456,6 +468,19 @@ def touches_at(
     """
     carriages = reachable_carriages(points, printer, label)
     return Touches(carriages, np.full(len(points), height), label, sigma)
+
+
+def travel_without_start(label: str, found: str, expected: str, next_step: str) -> InputError:
+    """Error for heights that are only how far the probe moved, from a height that is not stated."""
+    return InputError(
+        "these points of the bed have no heights, only how far the probe moved from a height that"
+        " the firmware does not print",
+        where=label,
+        found=quoted(found),
+        expected=expected,
+        next_step=next_step,
+        code="printer.probe_travel",
+    )
 
 
 def printer_number(

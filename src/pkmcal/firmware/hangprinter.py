@@ -23,6 +23,7 @@ from pkmcal.errors import InputError, legible
 from pkmcal.exporters.contract import Difference, Exporter, commented, largest
 from pkmcal.exporters.samples import samples
 from pkmcal.files import quoted
+from pkmcal.firmware.cables import ANCHOR_SIGMA, anchors_from_origin
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import scales
@@ -40,10 +41,6 @@ LINE_ROUNDING = 2e-7
 """Tolerance of a line's position, m: numbers are written to nine digits."""
 SPOOL_LETTERS = "RUOLH"
 """Letters of M666 with a value for each axis."""
-SHORTEST_LINE = 50.0
-"""Bound below which the longest line, mm, shows anchors in other units: metres or inches."""
-ANCHOR_SIGMA = 0.01
-"""Standard deviation of an anchor that was measured with a tape, m."""
 _K6 = re.compile(r"^[ \t]*M669[^;\n]*?[ \t]K6(?![0-9])", re.MULTILINE)
 _COMMAND = re.compile(r"^[ \t]*(M669|M666)([^;\n]*)", re.MULTILINE)
 _WORD = re.compile(r"([A-Z])([-+.,0-9:eE]+)")
@@ -226,11 +223,7 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
 
     Raises InputError for a configuration without anchors or with values that are no numbers.
     """
-    given: dict[str, tuple[str, str]] = {}
-    for match in _COMMAND.finditer(text):
-        where = f"{label}, line {text.count(chr(10), 0, match.start(1)) + 1}"
-        for letter, values in _WORD.findall(match.group(2)):
-            given[match.group(1) + letter] = values, where
+    given = _stated(text, label)
 
     def numbers(name: str, *sizes: int) -> Array:
         values, where = given[name]
@@ -258,6 +251,13 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
     # older firmwares write the height of D alone, which is above the origin
     anchors = [numbers(f"M669{c}", 3, 1) if c == "D" else numbers(f"M669{c}", 3) for c in letters]
     n = len(letters)
+    if "M669N" in given and not np.array_equal(numbers("M669N", 1), [n]):
+        raise InputError(
+            "M669 states another number of anchors than it gives",
+            where=given["M669N"][1],
+            found=f"N{given['M669N'][0]} with {', '.join(letters)}",
+            expected=f"N{n}, or the other anchors",
+        )
     out = {"anchors": np.array([a if len(a) == 3 else [0.0, 0.0, a[0]] for a in anchors])}
     if "M666R" not in given:
         return out
@@ -268,15 +268,39 @@ def hangprinter_words(text: str, label: str) -> dict[str, Array]:
             found=f"no {', '.join(missing)}",
             expected=f"Q, and {', '.join(SPOOL_LETTERS)} with a value for each axis",
         )
-    for letter in SPOOL_LETTERS:
+    for letter in (*SPOOL_LETTERS, "Q"):
         name = f"M666{letter}"
-        out[letter] = numbers(name, n)
-        if not (out[letter] > 0).all():
+        out[letter] = numbers(name, 1 if letter == "Q" else n)
+        # lines may be so thin that they build up nothing
+        least = 0.0 if letter == "Q" else np.finfo(float).tiny
+        if out[letter].min() < least:
             raise InputError(
-                f"M666 {letter} is not positive", where=given[name][1], expected="above zero"
+                f"M666 {letter} is no number of a spool",
+                where=given[name][1],
+                found=quoted(given[name][0]),
+                expected="0 or more" if letter == "Q" else "above 0",
             )
-    out["Q"] = numbers("M666Q", 1)
     return out
+
+
+def _stated(text: str, label: str) -> dict[str, tuple[str, str]]:
+    """Values of M669 and M666 as text, and their places, by command and letter; the last counts.
+
+    Raises InputError for words that are no letter with numbers.
+    """
+    given: dict[str, tuple[str, str]] = {}
+    for match in _COMMAND.finditer(text):
+        where = f"{label}, line {text.count(chr(10), 0, match.start(1)) + 1}"
+        if rest := _WORD.sub("", match.group(2)).split():
+            raise InputError(
+                f"a word of {match.group(1)} is no letter with numbers",
+                where=where,
+                found=quoted(rest[0]),
+                expected="numbers, with colons between those of several axes",
+            )
+        for letter, values in _WORD.findall(match.group(2)):
+            given[match.group(1) + letter] = values, where
+    return given
 
 
 def _model(text: str, label: str) -> NominalModel:
@@ -284,15 +308,10 @@ def _model(text: str, label: str) -> NominalModel:
     gives the spools, and otherwise the lines' positions. Raises InputError.
     """
     words = hangprinter_words(text, label)
-    anchors = 1e-3 * words["anchors"]
+    anchors = anchors_from_origin(
+        words["anchors"], [f"{label}, M669 {c}" for c in ANCHOR_LETTERS[: len(words["anchors"])]]
+    )
     lengths = np.linalg.norm(anchors, axis=1)
-    if 1e3 * lengths.max() < SHORTEST_LINE:
-        raise InputError(
-            "the anchors are too near to the origin for a Hangprinter",
-            where=f"{label}, M669",
-            found=f"{1e3 * lengths.max():.4g} mm at most",
-            expected=f"{SHORTEST_LINE:g} mm or more: M669's coordinates are in mm",
-        )
     reads = "the lines' positions: their lengths less those in the origin"
     if spools := "R" in words:
         reads = "the motors' turns from the origin, positive where the line becomes longer"

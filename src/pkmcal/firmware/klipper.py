@@ -177,9 +177,9 @@ class Klipper(Firmware):
         )
         return commented(lines, "#") + body
 
-    def print_radius(self, fit: Fit) -> str | None:
-        """Print radius, which Klipper has for linear deltas alone."""
-        return super().print_radius(fit) if fit.kind == "linear" else None
+    def has_print_radius(self, fit: Fit) -> bool:
+        """Whether the delta is linear: Klipper has none for rotary ones."""
+        return fit.kind == "linear"
 
     def steps(self, fit: Fit) -> Array | None:
         """None: Klipper has rotation_distance instead, with the printer's gears."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from pkmcal.errors import InputError, legible
 from pkmcal.files import quoted
-from pkmcal.files.quantities import LARGEST_UNITLESS_LENGTH
+from pkmcal.firmware.cables import ANCHOR_SIGMA, anchors_from_origin, check_millimetres
 from pkmcal.firmware.klipper import ROTARY_ANGLES, Klipper, homed, klipper_arm_angles
 from pkmcal.firmware.klipper_config import KlipperConfig, read_config
 from pkmcal.firmware.klipper_probing import KLIPPER_STEPPERS
@@ -29,10 +29,6 @@ from pkmcal.starter.sources import StarterSource
 ARM_MARGIN_BELOW = 5.0
 """Margin below the arms' lowest positions above the bed, degrees."""
 STEEPEST_ARM = 90.0
-SHORTEST_CABLE = 1.0
-"""Shortest length of a cable at home, mm."""
-SHORTEST_WINCH = 50.0
-"""Bound below which a winch's longest cable at home, mm, shows anchors in metres."""
 UP = np.array([0.0, 0.0, 1.0])
 OTHER_KINEMATICS: Mapping[str, str] = {
     "delta": "a linear delta is read with --printer FILE",
@@ -85,6 +81,7 @@ def _rotary_delta(config: KlipperConfig) -> NominalModel:
     ]
     radius = config.positive("printer", "shoulder_radius")
     height = config.positive("printer", "shoulder_height")
+    check_millimetres(max(radius, height, *arm, *rod), f"{config.label}, [printer]")
     # the export's formulas read a ConfigParser; values are text there
     parser = ConfigParser()
     printer = {"shoulder_radius": repr(radius), "shoulder_height": repr(height)}
@@ -122,23 +119,20 @@ def _rotary_delta(config: KlipperConfig) -> NominalModel:
                 (lowest[k], highest[k]),
             )
         )  # fmt: skip
-    return _checked(
-        NominalModel(
-            "klipper-rotary-delta",
-            (
-                f"A rotary delta by the values in {legible(config.label)}, in Klipper's frame. A"
-                " firmware has only the difference of the shoulders' radius and the tool's, so the"
-                " rods' lower ends stand in the platform's origin, the nozzle.",
-                "Leg 1 is stepper_a. Arms are level at 0 and rise with their readings; ranges end"
-                " at the end switches.",
-                *config.remarks(),
-            ),
-            (),
-            "translation",
-            tuple(legs),
-            1e-3 * UP * (low + top) / 2,
+    return NominalModel(
+        "klipper-rotary-delta",
+        (
+            f"A rotary delta by the values in {legible(config.label)}, in Klipper's frame. A"
+            " firmware has only the difference of the shoulders' radius and the tool's, so the"
+            " rods' lower ends stand in the platform's origin, the nozzle.",
+            "Leg 1 is stepper_a. Arms are level at 0 and rise with their readings; ranges end"
+            " at the end switches.",
+            *config.remarks(),
         ),
-        config,
+        (),
+        "translation",
+        tuple(legs),
+        1e-3 * UP * (low + top) / 2,
     )
 
 
@@ -150,40 +144,24 @@ def _winch(config: KlipperConfig) -> NominalModel:
     anchors = np.array([
         [config.number(name, f"anchor_{c}") for c in "xyz"] for name in (*names[:3], *more)
     ])  # fmt: skip
-    lengths = np.linalg.norm(anchors, axis=1)
-    if SHORTEST_CABLE <= lengths.max() < SHORTEST_WINCH:
-        raise InputError(
-            "the anchors are too near to the origin for a winch",
-            where=f"{config.label}, [stepper_a]",
-            found=f"{lengths.max():.4g} mm at most",
-            expected=f"{SHORTEST_WINCH:g} mm or more: Klipper's anchor_x, anchor_y and anchor_z are"
-            " in mm",
-            next_step="If these are metres, multiply them by 1000",
-        )
-    for name, anchor in zip(names, anchors, strict=False):
-        if np.linalg.norm(anchor) < SHORTEST_CABLE:
-            raise InputError(
-                "this cable has no length at home, the origin",
-                where=f"{config.label}, [{name}]",
-                found=", ".join(f"{value:g}" for value in anchor) + " mm",
-                expected="an anchor away from the origin",
-            )
-    return _checked(
-        NominalModel(
-            "klipper-winch",
-            (
-                f"A winch by the values in {legible(config.label)}: {len(anchors)} cables from"
-                " anchors to one point, the nozzle, each taken as straight. A reading is the"
-                " cable's length from the anchor's point to the nozzle.",
-                "Leg 1 is stepper_a. Home is Klipper's: the origin.",
-                *config.remarks(),
-            ),
-            (),
-            "translation",
-            tuple(NominalLeg.telescope(1e-3 * one, np.zeros(3), None) for one in anchors),
-            np.zeros(3),
+    places = [f"{config.label}, [{name}]" for name in names]
+    return NominalModel(
+        "klipper-winch",
+        (
+            f"A winch by the values in {legible(config.label)}: {len(anchors)} cables from"
+            " anchors to one point, the nozzle, each taken as straight. A reading is the"
+            " cable's length from the anchor's point to the nozzle.",
+            "Leg 1 is stepper_a. Home is Klipper's: the origin.",
+            *config.remarks(),
         ),
-        config,
+        (),
+        "translation",
+        tuple(
+            NominalLeg.telescope(one, np.zeros(3), None)
+            for one in anchors_from_origin(anchors, places)
+        ),
+        np.zeros(3),
+        sigma=ANCHOR_SIGMA,
     )
 
 
@@ -191,17 +169,3 @@ _MODELS: Mapping[str, Callable[[KlipperConfig], NominalModel]] = {
     "rotary_delta": _rotary_delta,
     "winch": _winch,
 }
-
-
-def _checked(model: NominalModel, config: KlipperConfig) -> NominalModel:
-    """The model, unchanged. Raises InputError for one that is too large, or singular at home."""
-    largest: float = max(float(np.abs(leg.start).max()) for leg in model.legs)
-    if largest > LARGEST_UNITLESS_LENGTH:
-        raise InputError(
-            "a joint is too far from the frame's origin",
-            where=config.label,
-            found=f"{largest:.3g} m",
-            expected=f"at most {LARGEST_UNITLESS_LENGTH:g} m",
-        )
-    model.check_home(config.label)
-    return model

@@ -18,6 +18,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, quoted, read_text
+from pkmcal.firmware.cables import check_millimetres
 from pkmcal.mechanisms import catalogue
 from pkmcal.starter import session_texts
 from pkmcal.starter.sources import SessionTexts, StarterSource
@@ -28,11 +29,16 @@ SUGGESTED_BELT_NOISE = "1 mm"
 LARGEST_FRAME = 20.0
 """Longest belt and largest coordinate of an anchor, m."""
 FEWEST_BELT_POSITIONS = 4
+ANCHOR_NAMES = ("tlX", "tlY", "trX", "trY", "brX")
+UNKNOWN_ANCHOR_SIGMA = "0.5"
+"""Standard deviation of the built-in machine's anchors for a log without any, m: the belts decide.
+"""
 _START = re.compile(r"CLBM:\[")
 _POSITION = re.compile(r"\{([^{}\n]*)\}")
 _LENGTH = re.compile(r"\b(bl|br|tr|tl)[ \t]*:[ \t]*([-+.0-9eE]+)")
-_ANCHOR = re.compile(r"Maslow_(tlX|tlY|trX|trY|brX)[ \t]*[=:][ \t]*([-+.0-9eE]+)")
+_ANCHOR = re.compile(rf"Maslow_({'|'.join(ANCHOR_NAMES)})[ \t]*[=:][ \t]*([-+.0-9eE]+)")
 _CENTER = re.compile(r"base: \{joint: revolute, center: \[[^\[\]]*\]\}")
+_CENTER_SIGMA = re.compile(r"(?<=^tolerance: \{center: )[^,}]*", re.MULTILINE)
 _HOME = re.compile(r"^home: .*$", re.MULTILINE)
 _RANGE = re.compile(r"range: \[[^\[\]]*\]")
 _NOISE = re.compile(r"^  noise: .*$", re.MULTILINE)
@@ -53,7 +59,7 @@ class MaslowLog(StarterSource):
     def read(
         self, text: str, path: Path, unit: str | None, given: Mapping[str, float]
     ) -> SessionTexts:
-        """Complete session. Raises InputError for logs without positions or anchors."""
+        """Complete session. Raises InputError for logs without usable positions."""
         del unit, given
         return _session_texts(text, path.name)
 
@@ -73,6 +79,8 @@ def _session_texts(text: str, label: str) -> SessionTexts:
         )
         x, y = anchors.mean(axis=0)
         mechanism = _HOME.sub(f"home: {{position: [{x:.4g}, {y:.4g}, 0.0]}}", mechanism)
+    else:
+        mechanism = _CENTER_SIGMA.sub(UNKNOWN_ANCHOR_SIGMA, mechanism)
     longest = 1.1 * float(lengths.max())
     texts["mechanism.yaml"] = _RANGE.sub(f"range: [0.1, {longest:.2f}]", mechanism)
     texts["session.yaml"] = _NOISE.sub(f"  noise: {SUGGESTED_BELT_NOISE}", texts["session.yaml"])
@@ -107,14 +115,26 @@ def belt_lengths(text: str, label: str) -> Array:
             found=len(out),
             expected=f"{FEWEST_BELT_POSITIONS} different ones or more",
         )
-    return np.array(list(out))
+    lengths = np.array(list(out))
+    check_millimetres(1e3 * float(lengths.max()), label)
+    return lengths
 
 
 def _anchors(text: str, label: str) -> Array | None:
-    """Anchors (4, 2), m, in the order of BELTS; None if the log does not give all."""
+    """Anchors (4, 2), m, in the order of BELTS; None for a log without them. Raises InputError for
+    a log with some of their coordinates alone.
+    """
     given = {name: _number(value) for name, value in _ANCHOR.findall(text)}
-    if len(given) < 5:
+    if not given:
         return None
+    if missing := [name for name in ANCHOR_NAMES if name not in given]:
+        raise InputError(
+            "the log does not give all anchors",
+            where=label,
+            found=f"no {', '.join(missing)}",
+            expected=f"all of {', '.join(ANCHOR_NAMES)}, or none",
+        )
+    check_millimetres(1e3 * max(map(abs, given.values())), f"{label}, the anchors")
     if not all(abs(value) <= LARGEST_FRAME for value in given.values()):
         raise InputError(
             "an anchor of the log has no place",

@@ -8,6 +8,10 @@ each. With the nozzle in the middle at Z max length, after homing, a carriage is
 switch by its endstop offset, in motor steps: the switch triggers at ``Z max length + sqrt(rod^2 -
 radius^2) + offset / steps per mm``.
 
+``Z-probe:10.66 X:0.00 Y:0.00`` of G29, G30 and G33 (Printer.cpp, runZProbe) is how far the probe
+moved down, with corrections, from a height that is not printed and depends on the version: such
+lines have no heights.
+
 All motors have one number of steps per mm, and the firmware rounds towers and rods to whole steps.
 """
 
@@ -24,12 +28,15 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
 from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length
+from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     TOWER_ANGLES,
     Firmware,
     Printer,
+    Touches,
     WrittenValues,
     printer_number,
+    travel_without_start,
 )
 from pkmcal.firmware.towers import (
     SettingNames,
@@ -50,6 +57,7 @@ RADIUS_CORRECTIONS, ROD_CORRECTIONS = (913, 917, 921), (933, 937, 941)
 ZERO_POSITIONS = (133, 137, 141)
 """Positions of X, Y and Z min pos, which move the end switches as well."""
 _EEPROM = re.compile(r"\bEPR:(\d+) (\d+) (\S+)(?: (.{0,60}))?")
+_TRAVEL = re.compile(r"\bZ-probe: ?-?\d{1,4}\.\d{1,6} X:[^\n]{0,60}")
 _WRITTEN = re.compile(r"M206 T(\d) P(\d+) [SX](\S+)(?: ; (.*))?")
 
 
@@ -80,6 +88,19 @@ class Repetier(Firmware):
         Raises InputError for missing, malformed or impossible values.
         """
         return _settings(_eeprom(text, path.name), path.name).printer(self, path.name)
+
+    def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
+        """None without lines of probing. Raises InputError for these, which have no heights."""
+        del printer
+        if (line := _TRAVEL.search(text)) is None:
+            return None
+        raise travel_without_start(
+            path.name,
+            line[0],
+            "the nozzle's positions at contact, in a table configuration,x [mm],y [mm],z [mm]",
+            "At seven places or more, lower the nozzle until it holds a sheet of paper, and write"
+            " X, Y and Z by M114 into such a table",
+        )
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header. Raises InputError for a machine without motor steps."""
@@ -170,9 +191,16 @@ def _eeprom(text: str, label: str) -> Words:
     out: Words = {}
     for n, line in enumerate(text.splitlines(), 1):
         match = _EEPROM.search(line) or _WRITTEN.match(line.strip())
-        if not match:
-            continue
         where, what = f"{label}, line {n}", "a value of this line"
+        if match is None:
+            if "EPR:" in line:
+                raise InputError(
+                    "this line of the EEPROM is damaged",
+                    where=where,
+                    found=quoted(line.strip()),
+                    expected="EPR:, the type, the position and a number, as M205 prints them",
+                )
+            continue
         expected = "a number in mm, degrees or steps"
         value = printer_number(match[3], what, where, line=match[0], expected=expected)
         out[match[2]] = value, where
@@ -181,17 +209,17 @@ def _eeprom(text: str, label: str) -> Words:
 
 def _settings(eeprom: Words, label: str) -> Settings:
     """Settings of the EEPROM. Raises InputError for missing or impossible values."""
-    for position in (ROD, RADIUS, HEIGHT, STEPS):
+    # M205 prints all of them, so a missing one is no 0
+    for position in (ROD, RADIUS, HEIGHT, STEPS, *SWITCHES, *ANGLES):
         if str(position) not in eeprom:
             raise InputError(
                 f"the EEPROM's value {position} is missing",
                 where=label,
-                expected=f"a line EPR:3 {position} with a number, as M205 prints it",
+                expected=f"a line EPR: with {position} and a number, as M205 prints it",
             )
 
-    def values(positions: tuple[int, ...], *default: float) -> Array:
-        pairs = zip(positions, default or 3 * (0.0,), strict=True)
-        return np.array([eeprom.get(str(k), (value, ""))[0] for k, value in pairs])
+    def values(positions: tuple[int, ...]) -> Array:
+        return np.array([eeprom.get(str(k), (0.0, ""))[0] for k in positions])
 
     for position in (ROD, RADIUS, HEIGHT, STEPS, REACH):
         value, place = eeprom.get(str(position), (1.0, ""))
@@ -209,7 +237,7 @@ def _settings(eeprom: Words, label: str) -> Settings:
     return Settings(
         rod=eeprom[str(ROD)][0] + values(ROD_CORRECTIONS),
         radius=eeprom[str(RADIUS)][0],
-        angle=values(ANGLES, *TOWER_ANGLES),
+        angle=values(ANGLES),
         offset=-values(SWITCHES) / steps,
         height=eeprom[str(HEIGHT)][0],
         probe=(0.0, 0.0, 0.0),

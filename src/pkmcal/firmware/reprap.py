@@ -297,6 +297,28 @@ def _check_numbers(line: str, where: str) -> None:
         )
 
 
+def _line_words(line: str, where: str) -> dict[str, Array]:
+    """Values of one line. Raises InputError for a word that is no letter with numbers within
+    bounds.
+    """
+    _, _, rest = line.partition(";")[0].strip().partition(" ")
+    try:
+        values = read_words(line)
+    except ValueError:
+        values = {"": np.array([np.inf])}
+    # what remains of a line without its words, as of a decimal comma, is none; NaN fails as well
+    if _WORD.sub("", rest).strip() or any(
+        not np.abs(v).max() <= LARGEST_PRINTER_VALUE for v in values.values()
+    ):
+        raise InputError(
+            "a value of this line is no number that a printer can have",
+            where=where,
+            found=quoted(line.strip()),
+            expected="letters with numbers in mm, degrees or steps",
+        )
+    return values
+
+
 def _checked_words(
     text: str, label: str, override: Path
 ) -> tuple[dict[str, Array], dict[str, str], tuple[str, ...]]:
@@ -325,18 +347,7 @@ def _checked_words(
                 )
             continue
         _check_numbers(line, f"{label}, line {n}")
-        try:
-            value = read_words(line)
-        except ValueError:
-            value = {"": np.array([np.inf])}
-        # NaN and infinity fail this comparison as well
-        if any(not np.abs(v).max() <= LARGEST_PRINTER_VALUE for v in value.values()):
-            raise InputError(
-                "a value of this line is no number that a printer can have",
-                where=f"{label}, line {n}",
-                found=quoted(line.strip()),
-                expected="numbers in mm, or degrees",
-            )
+        value = _line_words(line, f"{label}, line {n}")
         words.update({name.upper(): values for name, values in value.items()})
         places.update({name.upper(): f"{label}, line {n}" for name in value})
     return words, places, remarks
@@ -355,13 +366,10 @@ def _steps_per_mm(text: str, label: str) -> Array | None:
         if not line.startswith("M92 "):
             continue
         _check_numbers(line, f"{label}, line {n}")
-        try:
-            words = read_words(line)
-        except ValueError:
-            words = {"92X": np.array([np.nan]), "92Y": np.ones(1), "92Z": np.ones(1)}
+        words = _line_words(line, f"{label}, line {n}")
         if {"92X", "92Y", "92Z"} <= words.keys():
             steps = np.array([words[f"92{c}"][0] for c in "XYZ"])
-            if not ((steps > 0) & (steps <= LARGEST_PRINTER_VALUE)).all():
+            if steps.min() <= 0:
                 raise InputError(
                     "a value of this line is no number that a printer can have",
                     where=f"{label}, line {n}",

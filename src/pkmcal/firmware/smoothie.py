@@ -40,6 +40,7 @@ from pkmcal.firmware.contract import (
     misspelt_remarks,
     printer_number,
     touches_at,
+    travel_without_start,
 )
 from pkmcal.firmware.towers import (
     SettingNames,
@@ -134,12 +135,11 @@ class Smoothie(Firmware):
         points = np.array(_PROBED.findall(text), dtype=float)
         if len(points):
             return touches_at(means_by_position(points), 0.0, printer, path.name)
-        raise InputError(
-            "these points of G29 have no heights, only how far the probe moved",
-            where=path.name,
-            found=PROBING,
-            expected="lines such as 'X-86.6000 Y-50.0000 Z0.1234'",
-            next_step="Probe with G29.1, which prints them",
+        raise travel_without_start(
+            path.name,
+            PROBING,
+            "lines such as 'X-86.6000 Y-50.0000 Z0.1234'",
+            "Probe with G29.1, which prints them",
         )
 
     def text(self, fit: Fit, source: MachineSource) -> str:
@@ -165,10 +165,10 @@ class Smoothie(Firmware):
         ]
         return commented(lines, ";") + "\n".join(code) + "\n"
 
-    def print_radius(self, fit: Fit) -> str | None:
-        """None: Smoothieware has no print radius."""
+    def has_print_radius(self, fit: Fit) -> bool:
+        """False: Smoothieware has none."""
         del fit
-        return None
+        return False
 
     def named_values(self, fit: Fit, at: Fit) -> tuple[ExportedValue, ...]:
         """Letters of M665 and M666."""

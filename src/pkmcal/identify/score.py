@@ -11,7 +11,9 @@ standard deviations, the part of G that J does not explain is ``H = (I - J J^+) 
 
 are, to first order, the results of an estimate with the violation as a further unknown (Rao 1948):
 its value, the decrease of chi2, and the change of the unknowns. Under the model, chi2 has as many
-degrees of freedom as the violation has numbers that the data determine.
+degrees of freedom as the violation has numbers that the data determine. A number that can only be
+positive, such as a compliance, is tested one-sided: chi2 is zero where its value is negative, and
+its p-value half of that of the chi-squared distribution otherwise (Chernoff 1954).
 
 Correlated rows
 ---------------
@@ -145,6 +147,8 @@ class ScoreTests:
         from scipy.special import chdtrc
 
         made, chi2, dof = self._made, np.zeros(len(self._family)), np.zeros(len(self._family))
+        one_sided = np.zeros(len(self._family), dtype=bool)
+        one_sided[: len(made.listed)] = [one.positive for one in self._problem[2]]
         # listed violations, their columns projected orthogonally to the freed ones
         free = _ProjectedColumns.of(made, freed)
         for k in range(len(made.listed)):
@@ -156,6 +160,8 @@ class ScoreTests:
                 alone.value - across @ free.inverse @ free.value,
             )
             chi2[k], dof[k] = value.gain
+            if one_sided[k] and value.value[0] > 0:  # the number, -value / squared, is negative
+                chi2[k] = 0.0
         chi2[len(made.listed) :], dof[len(made.listed) :] = made.gains_of_singles(freed, free)
         chi2 /= self._variance
         for k, factor in self._scatter.items():
@@ -165,6 +171,7 @@ class ScoreTests:
         tests = np.bincount(self._family, weights=dof > 0)
         times = np.count_nonzero(tests) * tests[self._family]
         chance = np.where(dof > 0, chdtrc(np.maximum(dof, 1), chi2), 1.0)
+        chance[one_sided & (chi2 > 0)] /= 2
         adjusted = np.where(
             dof > 0, self._false_alarm.adjusted(Search.VIOLATIONS, chance, times), 1.0
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,10 @@ from pkmcal.judge.changes import CHANGE_ALPHA
 from pkmcal.judge.machine_change import MachineChange, machine_change
 from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.disturbances import growth_by_readings, tool_shift
 from pkmcal.mechanisms.region import REGION_AXES, Region
 from pkmcal.outcome import Verdict
-from pkmcal.outcome.finding import Finding, note, wrong
+from pkmcal.outcome.finding import Finding, doubtful, note, wrong
 from pkmcal.wording import amount, brief, count, listed, number
 
 DIFFERENCE_FORMAT = 1
@@ -351,8 +353,35 @@ def _with_verdict(d: MachineDifference) -> MachineDifference:
             advice = [note("difference.same_images", seed_a=seeds[0], seed_b=seeds[1])]
         else:
             advice = [note("difference.unmodelled")]
-    verdict = Verdict(not d.changed and not refused, headline, (*refused, *named, *advice))
-    return replace(d, verdict=verdict)
+    findings = (*refused, *named, *_temperature_findings(d), *advice)
+    return replace(d, verdict=Verdict(not d.changed and not refused, headline, findings))
+
+
+def _temperature_findings(d: MachineDifference) -> Iterator[Finding]:
+    """Warning about machines whose lengths hold at two temperatures, if the thermal growth that
+    they state moves the tool by more than the difference's standard deviation.
+    """
+    a, b = (side.machine.document.growth for side in (d.a, d.b))
+    if isinstance(d.tool, str) or a is None or b is None:
+        return
+    # second moments (2, 2) of the growth of drives and frame, mean of both machines
+    roots = [np.column_stack([[one.drives, one.frame], one.root]) for one in (a, b)]
+    square = np.mean([root @ root.T for root in roots], axis=0)
+    machine, (_, after) = d.a.machine, d.tool.evenly
+    poses = after.T_base_platform
+    by = growth_by_readings(machine, machine.inverse(poses), poses)
+    moved = np.stack([tool_shift(machine, poses, by[..., k]) for k in range(2)], axis=-1)
+    per_kelvin = np.sqrt(np.nanmean(np.einsum("nik,kl,nil->n", moved, square, moved)))
+    shift = float(abs(b.temperature - a.temperature) * per_kelvin)
+    sigma = float(np.sqrt(np.nanmean(after.position**2)))
+    if shift > max(sigma, ROUNDING):
+        yield doubtful(
+            "difference.temperature",
+            temperature_a=a.temperature,
+            temperature_b=b.temperature,
+            tool_shift=shift,
+            sigma=sigma,
+        )
 
 
 def _tool_clause(d: MachineDifference) -> str:

@@ -46,6 +46,8 @@ class Column:
         the first configuration after that.
     remark : for a column without a prior, its finding is only a remark and no reason against the
         result, whatever its effect.
+    positive : for a column of one number without a prior, whether only positive numbers are
+        possible; its score test is one-sided.
     prior : (k, l) root L of the numbers' prior covariance L L^T; None without a prior.
     at : (k,) values of the numbers with which the measurements were made, zero by default; an
         estimate is a change from these.
@@ -66,6 +68,7 @@ class Column:
     station: int | None = None
     since: int = 0
     remark: bool = False
+    positive: bool = False
     prior: Array | None = None
     at: Array | None = None
     facts: Callable[[Array, Array], Facts] = value_and_sigma

@@ -4,6 +4,7 @@ files.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from importlib import resources
@@ -22,6 +23,9 @@ from pkmcal.files import (
     validated_document,
     yaml_text,
 )
+from pkmcal.geometry.rigid import apply
+from pkmcal.levels import NEGLIGIBLE
+from pkmcal.mechanisms.disturbances import sag, tool_shift
 from pkmcal.mechanisms.document import MechanismDocument
 from pkmcal.mechanisms.document_checks import check_held
 from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
@@ -46,6 +50,11 @@ LARGEST_DEVIATION_SHARE = 0.25
 """Largest prior sigma as a share of the machine's size. If two points are each uncertain by more,
 only the order of magnitude of their distance is known; prior sigmas of real machines are a
 hundredth of it at most."""
+
+
+LARGEST_OFFSET_SHARE = 0.25
+"""Largest distance of a universal joint's axes as a share of the leg, up to which the leg's length
+is computed to rounding; that of real joints is a twentieth."""
 
 
 def catalogue() -> dict[str, Path]:
@@ -155,7 +164,50 @@ def checked_machine(
     for name in ("center", "offset", "radius", "arm"):
         value = getattr(checked.tolerance, name)
         check_plausible(value, machine, document.where(*keys, "tolerance", name), "a tolerance")
+    _check_sag(machine, document.where(*keys, "load"))
+    _check_offsets(machine, lambda leg: document.where(*keys, "legs", leg))
     return machine
+
+
+def _check_offsets(machine: Machine, where: Callable[[int], str]) -> None:
+    """Raise InputError for joints whose axes are apart by more than LARGEST_OFFSET_SHARE of their
+    leg's length at home. where : location of a leg, from 0, in its file.
+    """
+    offsets = machine.layout.offsets
+    if not len(offsets):
+        return
+    b = apply(machine.home(), machine.platform_centers())
+    lengths = np.linalg.norm(b - machine.base_centers(), axis=-1)
+    for leg, each in zip(offsets.leg.tolist(), offsets.offset, strict=True):
+        most, widest = LARGEST_OFFSET_SHARE * lengths[leg], float(np.abs(each).max())
+        if widest > most:
+            raise InputError(
+                f"the axes of a joint of leg {leg + 1} are too far apart for the leg",
+                where=where(leg),
+                found=f"{widest:g} m",
+                expected=f"at most {most:.2g} m, a quarter of the leg at home",
+                next_step="Write the offset in metres, or with its unit, such as 12 mm",
+            )
+
+
+def _check_sag(machine: Machine, where: str) -> None:
+    """Raise InputError for a load that shifts the tool at home by more than NEGLIGIBLE of the
+    machine's size: sag is of first order. where : location of the load in its file.
+    """
+    if machine.document.load is None:
+        return
+    home = machine.home()
+    shift = float(np.linalg.norm(tool_shift(machine, home, sag(machine, home))))
+    most = NEGLIGIBLE * machine.size
+    if shift > most:
+        raise InputError(
+            "the drives yield too far under the load",
+            where=where,
+            found=f"{shift:.2g} m at home, by mass, center, gravity and stiffness",
+            expected=f"at most {most:.2g} m, a hundredth of the machine's size",
+            next_step="Write the mass in kg, the center in metres and each stiffness in N/m, of"
+            " cranks in N m/rad: 1 N/um is 1e6 N/m",
+        )
 
 
 def check_plausible(value: float, machine: Machine, where: str, what: str) -> None:

@@ -267,6 +267,12 @@ class Growth(Schema):
     )
     correlation: Annotated[float, Field(gt=-1, lt=1)] = 0.0
 
+    @property
+    def root(self) -> Array:
+        """Root L (2, 2) of the covariance L L^T of drives and frame."""
+        mutual = np.array([[1.0, self.correlation], [self.correlation, 1.0]])
+        return np.diag(self.sigma) @ np.linalg.cholesky(mutual)
+
 
 TOLERANCE_RANGE = Field(ge=1e-12)
 """Range of prior sigmas of lengths, m. Smaller values would be exact; the upper bound depends on

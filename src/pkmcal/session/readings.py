@@ -38,11 +38,13 @@ TEMPERATURE_HEAD = re.compile(r"temperature(?: ?[\[(](?:°C|degC|C|(K))[\])])?")
 """Head of the column of temperatures; its group is kelvin."""
 ICE_POINT = 273.15
 """0 °C, K."""
+TEMPERATURE_RANGE = (-100.0, 200.0)
+"""Temperatures of machines, °C: beyond them they are in kelvin, or °C under kelvin."""
 
 
 def without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
     """Table of the readings alone, and the temperatures (K,) of its last column, °C, if it has one;
-    those without a unit are as they are.
+    those without a unit are as they are. Raises InputError for temperatures of no machine.
     """
     head = TEMPERATURE_HEAD.fullmatch(table.columns[-1]) if table.columns else None
     if head is None:
@@ -50,7 +52,18 @@ def without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
     readings = replace(
         table, columns=table.columns[:-1], values=table.values[:, :-1], units=table.units[:-1]
     )
-    return readings, table.values[:, -1] - (ICE_POINT if head[1] else 0.0)
+    temperature = table.values[:, -1] - (ICE_POINT if head[1] else 0.0)
+    least, most = TEMPERATURE_RANGE
+    if wrong := np.flatnonzero((temperature < least) | (temperature > most)).tolist():
+        raise InputError(
+            "no machine has this temperature",
+            where=f"{table.label}, line {table.lines[wrong[0]]}",
+            found=f"{temperature[wrong[0]]:g} °C under {table.columns[-1]}",
+            expected=f"{least:g} to {most:g} °C",
+            next_step="Head the column temperature [K], or temperature [°C]",
+            code="readings.temperature_unit",
+        )
+    return readings, temperature
 
 
 def rounding_step(readings: Array, unit: str, least: float) -> float | None:

@@ -148,7 +148,7 @@ class TrueEffects:
             warmer = np.expm1(-3 * np.linspace(0, 1, count)) / np.expm1(-3)
             temperature = ROOM_TEMPERATURE + warming * warmer
             stated = growth_of(nominal, temperature)
-            growth = rng.normal([stated.drives, stated.frame], stated.sigma)
+            growth = [stated.drives, stated.frame] + stated.root @ rng.standard_normal(2)
         return cls(compliant, temperature, growth)
 
     def readings(self, machine: Machine, joints: Array, poses: Array) -> Array:

@@ -175,29 +175,22 @@ class NominalModel:
         document = parse_yaml(self.text(), Path("mechanism.yaml"))
         return checked_machine(validated_document(document, MechanismDocument), document)
 
-    def check_reach(self, where: str) -> None:
-        """Raise InputError for a model with legs that do not reach the platform at home.
+    def check_home(self, where: str, expected: str | None = None) -> None:
+        """Raise InputError for a model with legs that do not reach the platform at home, and for
+        one whose platform could move there with all motors at rest.
 
-        where : of the message.
+        where, expected : of the message; expected where the platform could move.
         """
         machine = self.machine()
-        readings = machine.inverse(machine.home()[None])[0]
+        readings = machine.inverse(machine.home()[None])
         if not np.isfinite(readings).all():
             raise InputError(
                 "legs do not reach the platform at home",
                 where=where,
-                found=listed([str(k + 1) for k in np.flatnonzero(~np.isfinite(readings))]),
+                found=listed([str(k + 1) for k in np.flatnonzero(~np.isfinite(readings[0]))]),
                 expected="lengths, arms or spools with which they do",
             )
-
-    def check_home(self, where: str, expected: str | None = None) -> None:
-        """Raise InputError for a model whose platform could move at home with all motors at rest.
-
-        where, expected : of the message.
-        """
-        machine = self.machine()
-        readings = machine.inverse(machine.home()[None])
-        if machine.forward_result(readings).singularity[0] < NEAR_SINGULAR:
+        if not machine.forward_result(readings).singularity[0] >= NEAR_SINGULAR:
             raise InputError(
                 "the platform could move with all motors at rest: its pose at home is singular",
                 where=where,

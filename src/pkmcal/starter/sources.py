@@ -71,7 +71,7 @@ def read_source(
     unit : of its lengths, None unless the user named it. given : dimensions by name, m.
 
     Raises InputError for a file that no source or more than one claims, for options that its
-    source does not take, and for a machine that does not reach its home.
+    source does not take, and for a machine that does not reach its home or is singular there.
     """
     text = read_text(path)
     claiming = [one for one in starter_sources() if one.claims(text, path)]
@@ -97,5 +97,5 @@ def read_source(
         )
     out = source.read(text, path, unit, given)
     if isinstance(out, NominalModel):
-        out.check_reach(path.name)
+        out.check_home(path.name)
     return out
