@@ -325,12 +325,35 @@ def test_four_cables_are_calibrated_where_a_tracker_measured_every_pose(tmp_path
         result = calibrate_session(tmp_path / str(seed))
         assert result.verdict.usable
         assert "machine.not_held" in result.verdict.codes
+        # the poses' noise is a tenth of the residuals, so a factor on it alone proves nothing
+        assert "data.scatter" not in result.verdict.codes
         assert np.isnan(result.tool_error(poses).position).all()
         true = lengths_at(poses, anchors, joints) - offsets
         # the frames of base and platform are conventions
         best = least_squares(off_by, np.zeros(12), args=(result.machine, poses, true))
         ratios.append(np.sqrt(np.mean(best.fun**2)) / platform_sigma(result.estimate))
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_poses_of_four_cables_that_scatter_more_than_stated_are_told(tmp_path):
+    four_cables(tmp_path / "s", 1)
+    path = tmp_path / "s" / "session.yaml"
+    text = path.read_text().replace("0.05 mm", "0.02 mm").replace("1.0e-4", "4.0e-5")
+    path.write_text(text.replace("0.2 mm", "0.08 mm"), encoding="utf-8")
+    verdict = calibrate_session(tmp_path / "s").verdict
+    assert not verdict.usable
+    assert "data.misfit" in verdict.codes
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_wrong_reading_of_four_cables_is_told(tmp_path, seed):
+    """Where a pose is rejected, nothing else determines two of its numbers."""
+    _, readings, _ = four_cables(tmp_path / "s", seed)
+    readings[4, 0] += 0.01
+    table("joints", "leg1,leg2,leg3,leg4", readings, tmp_path / "s")
+    assert {"readings.single", "readings.outvoted"} & set(
+        calibrate_session(tmp_path / "s").verdict.codes
+    )
 
 
 def off_by(frames, machine, poses, true):

@@ -688,7 +688,9 @@ def explain_poses(
     richer : model of the mechanism file that explains the poses. If they agree with that model, no
         hypothesis is compared.
     """
-    if not estimate.pose_weights.size:
+    # legs that do not hold the platform leave its pose to the measurement, so that residuals of the
+    # poses alone, which are compared here, take up errors of the readings
+    if not estimate.pose_weights.size or session.machine.layout.underdetermined:
         return Explanation()
     misfit = pose_misfit(estimate)
     richer_misfit = np.inf if richer is None else richer.scale

@@ -775,6 +775,7 @@ def _statistics(
     unknowns = rank_of_normal(normal) + own
     components = result.components
     freedom = components.freedom[0].tolist()
+    of_poses, of_links = result.noise_of(POSE_ROWS), result.noise_of(LINK_ROWS)
     return Statistics(
         chi2=sum(chi2) + chi2_drawing,
         dof=n_edges + n_joints + n_poses + n_links + n_drawing - unknowns,
@@ -795,12 +796,14 @@ def _statistics(
         dof_poses=freedom[POSE_ROWS],
         reading_scale=float(result.reading_scale[0]),
         reading_range=_range(result.reading_noise, result.reading_scale),
-        pose_range=_range(result.noise_of(POSE_ROWS), result.scale.poses),
+        pose_range=_range(of_poses, result.scale.poses),
+        pose_chance=float(of_poses.stated_chance(result.scale.poses)[0]),
         chi2_links=chi2[3],
         n_links=n_links,
         link_scale=float(result.scale.links[0]),
         dof_links=freedom[LINK_ROWS],
-        link_range=_range(result.noise_of(LINK_ROWS), result.scale.links),
+        link_range=_range(of_links, result.scale.links),
+        link_chance=float(of_links.stated_chance(result.scale.links)[0]),
         shading=float(np.median(problem.shading[0])) if problem.shading.size else SHADING_SIGMA,
         look_scatter=float(np.sqrt(imputation_covariance)),
     )

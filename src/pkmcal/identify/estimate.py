@@ -25,7 +25,8 @@ class GroupStatistics(NamedTuple):
 
     name : edges, poses, readings or links. scale : factor on the stated noise. chi2 : with that
     noise. n : numbers. dof : degrees of freedom that the residuals have left. noise_range : factors
-    on the stated noise that the data allow, smallest and largest; None for edges.
+    on the stated noise that the data allow, smallest and largest; None for edges. chance : p-value
+    of all noise being as stated; None for edges and readings.
     """
 
     name: str
@@ -34,6 +35,7 @@ class GroupStatistics(NamedTuple):
     n: float
     dof: float
     noise_range: tuple[float, float | None] | None
+    chance: float | None
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,12 @@ class Statistics:
     reading_scale : factor on the readings' stated noise, 1 where the data do not contradict it.
     reading_range, pose_range : confidence interval of the factors on the stated noise, None for no
         upper bound (:mod:`pkmcal.identify.noise`).
+    pose_chance : p-value of all noise being as stated, from the poses' residuals; None where the
+        noise is not estimated.
     look_scatter : scatter of the result with the prediction from which edges were measured,
         relative to its standard deviations by noise; the covariance contains it.
-    chi2_links, n_links, dof_links, link_scale, link_range : the same of measurements that link two
-        configurations.
+    chi2_links, n_links, dof_links, link_scale, link_range, link_chance : the same of measurements
+        that link two configurations.
     """
 
     chi2: float
@@ -82,12 +86,14 @@ class Statistics:
     reading_scale: float = 1.0
     reading_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
     pose_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
+    pose_chance: float | None = field(default=None, repr=False)
     look_scatter: float = 0.0
     chi2_links: float = field(default=0.0, repr=False)
     n_links: float = field(default=0.0, repr=False)
     dof_links: float = field(default=0.0, repr=False)
     link_scale: float = field(default=1.0, repr=False)
     link_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
+    link_chance: float | None = field(default=None, repr=False)
 
     @property
     def chi2_as_stated(self) -> float:
@@ -103,13 +109,13 @@ class Statistics:
     def groups(self) -> tuple[GroupStatistics, ...]:
         """Statistics of each group of rows."""
         rows = (
-            ("edges", self.noise_scale, self.chi2_edges, self.n_edges, self.dof_edges, None),
+            ("edges", self.noise_scale, self.chi2_edges, self.n_edges, self.dof_edges, None, None),
             ("poses", self.pose_scale, self.chi2_poses, self.n_poses, self.dof_poses,
-             self.pose_range),
+             self.pose_range, self.pose_chance),
             ("readings", self.reading_scale, self.chi2_joints, self.n_joints, self.dof_joints,
-             self.reading_range),
+             self.reading_range, None),
             ("links", self.link_scale, self.chi2_links, self.n_links, self.dof_links,
-             self.link_range),
+             self.link_range, self.link_chance),
         )  # fmt: skip
         return tuple(GroupStatistics(*one) for one in rows)
 

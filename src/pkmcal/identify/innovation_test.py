@@ -60,7 +60,10 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
         for run, k, place in np.argwhere(rejected[:, cut]).tolist():
             at = slice(n * place, n * (place + 1))
             r, a = value[run, k, at], by[run, k, at]
-            square = r @ np.linalg.solve(scale[run] ** 2 * np.eye(n) + a @ a.T, r)
+            # by singular values, which are huge along directions that no other row determines
+            turn, size, _ = np.linalg.svd(a)
+            variance = scale[run] ** 2 + np.pad(size, (0, n - len(size))) ** 2
             row = cut.start + k
+            square = np.sum((turn.T @ r) ** 2 / variance)
             out[run, row, place] = scale[run] * np.sqrt(square) * factor[row, place]
     return out

@@ -56,8 +56,10 @@ class NoiseOptions:
     # groups of configurations: variances remain exact, but correlations between groups, which are
     # due to the few shared unknowns, are neglected
     largest_group: int = 400
-    # eigenvalue of M below which it is rounding: the unknowns absorb the whole direction
-    rounding: float = 1e-10
+    # eigenvalue of M, the variance of a residual in units of the noise, below which the unknowns
+    # absorb the whole direction: a round's residuals are exact to 1e-3
+    # (BatchOptions.nearly_solved), so smaller ones are what the search has left
+    rounding: float = 1e-6
     # grid of log s^2: its end to either side (the lower one stands for zero), and number of values
     largest_log_variance: float = 20.0
     variances: int = 41
@@ -178,6 +180,18 @@ class NoiseShares:
         """Whether the data exclude the present noise of the kind, (B,)."""
         low, high = self.interval()
         return (low > 1) | (high < 1)
+
+    def stated_chance(self, scale: Array) -> Array:
+        """P-value (B,) of all noise being as stated, by the likelihood ratio against the best noise
+        of this kind and of all others.
+
+        scale : (B,) factor on the kind's stated noise in use.
+        """
+        from scipy.special import chdtrc
+
+        variance = self.own / scale[:, None] ** 2 + self.others + self.fixed
+        stated = np.sum(np.log(variance) + self.z**2 / variance, axis=-1)
+        return chdtrc(2, np.maximum(stated - self._best[1], 0.0))
 
     @cached_property
     def _intervals(self) -> dict[float, tuple[Array, Array]]:

@@ -200,7 +200,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     tubes = zip(noise.scale, noise.shading, noise.dof, strict=True)
     units = dict.fromkeys(session.machine.joint_units)
     groups = [one._replace(name=group_label(session, one.name)) for one in s.groups]
-    nominal = GroupStatistics("nominal model", 1.0, s.chi2_drawing, s.n_drawing, 0.0, None)
+    nominal = GroupStatistics("nominal model", 1.0, s.chi2_drawing, s.n_drawing, 0.0, None, None)
     return (
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
