@@ -24,7 +24,6 @@ from pkmcal.levels import (
     FEW,
     MAJORITY,
     NEGLIGIBLE,
-    RELEVANT_SHARE,
     ROUNDING,
     UNEXPLAINED_SCALE,
 )
@@ -65,8 +64,8 @@ class VerdictOptions:
     # since it hardly increases the standard deviation
     least_noise_share: float = FEW
     # displacement by one undetermined motion, relative to the platform's standard deviation, that
-    # causes a warning
-    worth_reporting: float = RELEVANT_SHARE
+    # causes a warning: one half increases the standard deviation by an eighth
+    worth_reporting: float = 0.5
     # share of configurations near a singular pose above which the estimate is not reliable
     singular_share: float = MAJORITY
     # share of the undetermined displacement above which one motion is a reason of its own
