@@ -24,7 +24,7 @@ from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_error, reversed_motor
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.hypotheses import SuspectStation, mistake
+from pkmcal.observe.hypotheses import SuspectStation, image_mistake
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, fitting
 from pkmcal.observe.pose_likelihood import StationView
@@ -370,7 +370,7 @@ def mistake_in(
     still = frozen_in(session)
     if still is not None and not leg_localization.complete:  # an error in any case, and cheaper
         return still
-    error = mistake(suspect_stations(session, images, leg_localization), rng)
+    error = image_mistake(suspect_stations(session, images, leg_localization), rng)
     return error and (still or error)
 
 
