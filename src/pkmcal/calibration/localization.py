@@ -467,9 +467,9 @@ def locate_stations(
         # base
         value = localize_by_legs(session, images, poses, rngs[1:], boards, start_poses)
         progress("Testing hypotheses about the images", 0.8)
-        mixed_up = mistake_in(session, images, value, rngs[0])
-        if mixed_up is not None:
-            return StationSearch(value, start_poses, mixed_up)
+        mistake = mistake_in(session, images, value, rngs[0])
+        if mistake is not None:
+            return StationSearch(value, start_poses, mistake)
         start_poses[[p.station for p in images]] = [
             pose.T_camera_base for pose in value.localizations
         ]
