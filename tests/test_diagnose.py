@@ -16,7 +16,7 @@ from pkmcal.calibration.localization import boards_of, localize_stations, read_i
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import hypotheses
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.hypotheses import SuspectStation, _best_names, mistake
+from pkmcal.observe.hypotheses import SuspectStation, _best_names, image_mistake
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.station_localization import LocalizedPose, find_station
@@ -50,7 +50,7 @@ def pictures(count=6):
 def refusal(*words, seed=0, **more):
     """Findings on one station; see :func:`looked_for`."""
     rng = np.random.default_rng(seed)
-    return mistake([search(rng, *words, **more)], rng)
+    return image_mistake([search(rng, *words, **more)], rng)
 
 
 def search(rng, pictures, readings=None, configuration=None, mechanism=None, by_hand=None):
@@ -107,7 +107,7 @@ def test_right_sessions_have_no_finding(by_hand):
     rng = np.random.default_rng(0)
     station = search(rng, pictures(), by_hand=given(by_hand), mechanism=redrawn(1, 0.002))
     assert station.localization.sure
-    assert mistake([station], rng) is None
+    assert image_mistake([station], rng) is None
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_images_of_one_configuration_are_not_taken_for_exchanged():
     station = station._replace(
         localization=replace(station.localization, log_likelihood_ratio=short)
     )
-    assert mistake([station], rng) is None
+    assert image_mistake([station], rng) is None
 
 
 def test_two_images_exchanged_beside_two_of_one_configuration():
@@ -209,7 +209,7 @@ def test_two_images_exchanged_at_the_station_that_is_localized_most_surely():
         station._replace(name=name, localization=replace(station.localization, p_value=p_value))
         for station, name, p_value in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
     ]
-    error = mistake(stations, rng)
+    error = image_mistake(stations, rng)
     assert "images of front bear each other's names" in str(error)
     assert "images/front/e.png fits configuration e" in str(error)
 
@@ -265,7 +265,7 @@ def test_diameters_for_radii():
     rng, nominal = np.random.default_rng(0), mechanism.with_values(values)
     station = search(rng, pictures(), mechanism=nominal, by_hand=given(True))
     unsure = station._replace(localization=replace(station.localization, p_value=1.0))
-    error = mistake([unsure], rng)
+    error = image_mistake([unsure], rng)
     assert "the tubes' radii look like diameters" in str(error)
 
 
@@ -287,7 +287,7 @@ def test_another_machine_is_not_surely_localized_and_nothing_is_renamed():
     rng, readings = np.random.default_rng(0), other.inverse(poses())
     station = search(rng, pictures(), readings, mechanism=other, by_hand=given(True))
     assert not station.localization.sure
-    error = mistake([station], rng)
+    error = image_mistake([station], rng)
     assert error is None or "not localized" in str(error)
 
 
@@ -307,7 +307,7 @@ def test_log_odds_of_an_exchange_grow_with_the_other_stations(monkeypatch, p_val
     monkeypatch.setattr(
         hypotheses, "likelihood_from", lambda view, _: 0.0 if view is two.view else 1e3
     )
-    error = mistake([two], rng)
+    error = image_mistake([two], rng)
     assert error is not None
     assert ("not localized" in error.what) != named
     if not named:

@@ -20,6 +20,7 @@ from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.handheld import (
     CAMERA_TURNED_REASON,
     EDGES_DISAGREE_REASON,
+    few_legs_reason,
     inconsistent_poses,
     without_misplaced,
 )
@@ -708,17 +709,17 @@ def test_an_image_in_which_no_leg_can_be_measured_is_left_out(searched):
     assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert sorted(results.scene.edges) == [0, 1]
     (rejected,) = results.session.rejected
-    assert rejected.finding.facts["reason"] == EDGES_DISAGREE_REASON
+    assert rejected.finding.facts["reason"] == few_legs_reason(session.machine)
 
 
 def test_legs_are_measured_where_an_image_is_and_not_elsewhere(searched):
     session, images, poses, truth = searched
     p = images[EASIEST]
     there = PriorScene(session.machine, truth.T_camera_base, poses)
-    assert not handheld._too_few_edges(there, p)
+    assert not handheld._too_few_legs(there, p)
     turn = pose(rotation(np.array([0.0, 0.0, np.radians(40.0)])), np.zeros(3))
     elsewhere = there._replace(T_camera_base=truth.T_camera_base @ turn)
-    assert handheld._too_few_edges(elsewhere, p)
+    assert handheld._too_few_legs(elsewhere, p)
 
 
 def test_check_reports_which_images_are_sure(simulated, searched):

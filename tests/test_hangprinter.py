@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import pkmcal
 from export_sources import source_of
+from hangprinters import CONFIG, machine_of
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
-from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import pose
-from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
+from pkmcal.mechanisms import load_mechanism
 from pkmcal.simulation.truth import true_machine
-
-CONFIG = """\
-; Hangprinter parameters
-M669 K6 N4 A-15.5:-1610.25:-131.5 B1314.5:1268.5:-121.25 C-1415.75:707.5:-121.75 D18.25:-0.25:2299.5
-M666 Q0.038 R75.1:74.9:75.2:75.05 U2:2:2:4 O1:1:1:2 L20:20:20:20 H255:255:255:255 J25:25:25:25
-"""
-
-
-def machine_of(text, folder):
-    (folder / "config.g").write_text(text, encoding="utf-8")
-    texts = pkmcal.new(from_file=folder / "config.g").texts
-    document = parse_yaml(texts["mechanism.yaml"], Path("mechanism.yaml"))
-    return machine_from_document(validated_document(document, MechanismDocument))
 
 
 def firmware_steps(text, points, microsteps=16):

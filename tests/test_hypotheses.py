@@ -27,7 +27,7 @@ from pkmcal.mechanisms.reading_hypotheses import (
     reading_hypotheses,
 )
 from pkmcal.outcome.hypotheses import (
-    OPTIONS,
+    HYPOTHESIS_THRESHOLDS,
     EvidenceLevel,
     Hypothesis,
     decide,
@@ -79,7 +79,7 @@ def test_log_odds_are_those_of_bayes():
 
 
 def test_the_cheapest_level_that_decides_is_the_last():
-    cheap, _ = level("cheap", {"a": OPTIONS.act + 1, "b": -1.0})
+    cheap, _ = level("cheap", {"a": HYPOTHESIS_THRESHOLDS.act + 1, "b": -1.0})
     costly, given = level("costly", {"a": 0.0, "b": 0.0})
     ranked = posterior([named("a"), named("b")], [cheap, costly])
     assert decide(ranked).hypothesis.code == "a"
@@ -87,9 +87,9 @@ def test_the_cheapest_level_that_decides_is_the_last():
     assert given == []
 
 
-@pytest.mark.parametrize("other", [OPTIONS.act, 2.0])
+@pytest.mark.parametrize("other", [HYPOTHESIS_THRESHOLDS.act, 2.0])
 def test_a_level_does_not_decide_between_explanations_that_it_cannot_distinguish(other):
-    cheap, _ = level("cheap", {"a": OPTIONS.act + 1, "b": other})
+    cheap, _ = level("cheap", {"a": HYPOTHESIS_THRESHOLDS.act + 1, "b": other})
     costly, given = level("costly", {"a": 1.0, "b": 20.0})
     ranked = posterior([named("a"), named("b")], [cheap, costly])
     assert given == [["a", "b"]]
@@ -97,7 +97,7 @@ def test_a_level_does_not_decide_between_explanations_that_it_cannot_distinguish
 
 
 def test_variants_of_one_explanation_are_no_rivals():
-    cheap, _ = level("cheap", {"a": OPTIONS.act + 1})
+    cheap, _ = level("cheap", {"a": HYPOTHESIS_THRESHOLDS.act + 1})
     costly, given = level("costly", {"a": 0.0})
     ranked = posterior([named("a", "motor 1"), named("a", "motor 1")], [cheap, costly])
     assert given == []
@@ -107,7 +107,9 @@ def test_variants_of_one_explanation_are_no_rivals():
 def test_what_the_likelihood_drops_is_not_weighed_again():
     """The prior of a hypothesis alone drops none: more evidence may outweigh it."""
     cheap, _ = level(
-        "cheap", {"best": 1.0, "rare": 0.5, "worse": -OPTIONS.beam, "none": -np.inf}, decides=False
+        "cheap",
+        {"best": 1.0, "rare": 0.5, "worse": -HYPOTHESIS_THRESHOLDS.beam, "none": -np.inf},
+        decides=False,
     )
     costly, given = level("costly", {"best": 0.0, "rare": 100.0})
     ranked = posterior(
@@ -126,9 +128,12 @@ def test_only_so_many_go_on():
 
 
 def test_a_repair_needs_more_than_a_report():
-    between = 0.5 * (OPTIONS.report + OPTIONS.act)
-    for action, limit in (("refuse", OPTIONS.report), ("repair", OPTIONS.act)):
-        for odds in (OPTIONS.report - 0.1, between, OPTIONS.act + 0.1):
+    between = 0.5 * (HYPOTHESIS_THRESHOLDS.report + HYPOTHESIS_THRESHOLDS.act)
+    for action, limit in (
+        ("refuse", HYPOTHESIS_THRESHOLDS.report),
+        ("repair", HYPOTHESIS_THRESHOLDS.act),
+    ):
+        for odds in (HYPOTHESIS_THRESHOLDS.report - 0.1, between, HYPOTHESIS_THRESHOLDS.act + 0.1):
             one, _ = level("only", {"a": odds})
             assert (decide(posterior([named("a", action=action)], [one])) is not None) == (
                 odds > limit
@@ -137,12 +142,19 @@ def test_a_repair_needs_more_than_a_report():
 
 def test_rivals_are_reported_that_are_likely_themselves():
     """What the first hypothesis does not exclude may still be less likely than no mistake."""
-    first = OPTIONS.report + 1
-    one, _ = level("only", {"a": first, "b": OPTIONS.report + 0.5, "c": OPTIONS.report - 0.5})
+    first = HYPOTHESIS_THRESHOLDS.report + 1
+    one, _ = level(
+        "only",
+        {
+            "a": first,
+            "b": HYPOTHESIS_THRESHOLDS.report + 0.5,
+            "c": HYPOTHESIS_THRESHOLDS.report - 0.5,
+        },
+    )
     ranked = posterior([named("c"), named("a"), named("b")], [one])
     assert [each.hypothesis.code for each in likely(ranked)] == ["a", "b"]
     assert {each.hypothesis.code for each in rivals_of(ranked)} == {"b", "c"}
-    weak, _ = level("only", {"a": OPTIONS.report - 0.1})
+    weak, _ = level("only", {"a": HYPOTHESIS_THRESHOLDS.report - 0.1})
     assert likely(posterior([named("a")], [weak])) == []
 
 

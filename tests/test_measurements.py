@@ -164,7 +164,6 @@ def test_words_of_a_kind(kind):
     assert kind.one != kind.label
     assert kind.unit in ("px", "m", "rad", "m or rad")
     assert 1 <= kind.numbers <= 6
-    assert kind.joins == (2 if issubclass(kind, LinkKind) else 1)
     assert len({other.one for _, other in KINDS}) == len(KINDS)
 
 

@@ -10,7 +10,7 @@ from pkmcal.calibration.calibrate import Clock, calibrate_session, settle
 from pkmcal.calibration.handheld import localize_case
 from pkmcal.errors import InputError
 from pkmcal.outcome.finding import note
-from pkmcal.outcome.hypotheses import OPTIONS, Explanation, refuse
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS, Explanation, refuse
 from pkmcal.session.load import load_session
 from test_pose_sessions import make, write_joints
 
@@ -29,7 +29,10 @@ def test_the_likeliest_explanation_is_the_reason_of_a_refusal():
     def explained(*given):
         return [lambda each=each: computed.append(each) or each for each in given]
 
-    weak, strong = Explanation(one, OPTIONS.act - 1), Explanation(other, OPTIONS.act + 1)
+    weak, strong = (
+        Explanation(one, HYPOTHESIS_THRESHOLDS.act - 1),
+        Explanation(other, HYPOTHESIS_THRESHOLDS.act + 1),
+    )
     open_left = Explanation(untested=untested)
     with pytest.raises(InputError) as caught:
         refuse(*explained(weak, strong, open_left))

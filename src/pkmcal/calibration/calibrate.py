@@ -19,7 +19,7 @@ from pkmcal.calibration.camera_refinement import CameraRefinement, refinement_of
 from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.chance_matches import (
     chance_match_reason,
-    explain_images,
+    explain_chance_matches,
     misplaced_stations,
 )
 from pkmcal.calibration.discrepancy_basis import ModelError, discrepancy_findings, explains_heights
@@ -368,7 +368,7 @@ def settle(
             turns = _identify(case, refine_camera, now.part(0, 0.9), options)
         except ResultError:
             refuse(
-                partial(explain_images, case, None, seed),
+                partial(explain_chance_matches, case, None, seed),
                 partial(explain_radii, case, None, refine_camera, seed),
             )
             raise
@@ -398,7 +398,7 @@ def settle(
     richer, failed = richer_model(case.session, turns.measurements, stated)
     untested = refuse(
         partial(explain_poses, case.session, turns.measurements, stated, richer),
-        partial(explain_images, case, turns, seed),
+        partial(explain_chance_matches, case, turns, seed),
         partial(explain_radii, case, turns, refine_camera, seed),
     )
     found = (rotation_finding(one) for one in (*repairs, *rotations))
@@ -529,16 +529,19 @@ def _judge(
     session, turns = _as_measured(case.session, value.turns), value.turns
     detections: tuple[DetectedViolation, ...] = ()
     errors: tuple[ModelError, ...] = ()
-    uneven: tuple[Column, ...] = ()
-    without = value.estimate
+    discrepancy_columns: tuple[Column, ...] = ()
+    # Identifiability follows from the information of the data, to which the discrepancy adds
+    # nothing. It is computed from the estimate before the discrepancy, whose linearization is
+    # cached; the accuracy over a bed takes the discrepancy's columns beside it.
+    without_discrepancy = value.estimate
     # score tests need the minimum of the joint problem, where the papers' methods do not end
     if method == "bundle":
-        detections, errors, estimate, uneven = model_violations(
+        detections, errors, estimate, discrepancy_columns = model_violations(
             session, turns.observation, turns.measurements, value.estimate
         )
         value = value._replace(estimate=with_estimated_effects(session, estimate))
     # identifiability, and findings other than those of the verdict
-    identification = _identification(turns.measurements, without, uneven)
+    identification = _identification(turns.measurements, without_discrepancy, discrepancy_columns)
     others = (
         *_findings_of_estimate(
             session, value, identification, detections, errors, method == "bundle"
@@ -631,11 +634,12 @@ def _findings_of_estimate(
 
 
 def _identification(
-    measurements: Measurements, estimate: Estimate, uneven: tuple[Column, ...]
+    measurements: Measurements, estimate: Estimate, discrepancy_columns: tuple[Column, ...]
 ) -> Identification:
     """Identifiability of the machine's parameters, in words, and the papers' conditions.
 
-    uneven : columns of the model discrepancy, which for heights is an uneven bed.
+    estimate : without the discrepancy in its covariances.
+    discrepancy_columns : of the model discrepancy, which for heights alone is an uneven bed.
     """
     observed = observed_legs(
         measurements.edges,
@@ -651,7 +655,7 @@ def _identification(
     if only_heights(estimate):
         from pkmcal.identify.bed import bed_of
 
-        bed = bed_of(estimate, uneven)
+        bed = bed_of(estimate, discrepancy_columns)
     return explain(values, estimate, observed_by_boards(observed, measurements), counted, bed)
 
 

@@ -32,7 +32,7 @@ from pkmcal.measurements import Column, EdgeSet, Measurements, concatenate
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.hypotheses import (
-    OPTIONS,
+    HYPOTHESIS_THRESHOLDS,
     EvidenceLevel,
     Hypothesis,
     Ranked,
@@ -48,7 +48,7 @@ hundred and fifty edges detect a wrong response at six standard deviations."""
 LEAST_RESPONSE_GAIN = 2.7
 """Decrease of chi2 above which all images are measured by the other response (exceeded by chance in
 one session of ten)."""
-MOST_TURN_DEVIATION = (2 * OPTIONS.act) ** -0.5
+MOST_TURN_DEVIATION = (2 * HYPOTHESIS_THRESHOLDS.act) ** -0.5
 """Standard deviation of the change above which few images do not decide: with a smaller one the
 odds between no change and a whole one, 0 and 1, are those of an act."""
 _Camera = tuple[str, Response]
@@ -111,7 +111,7 @@ def response_finding(one: Ranked[ResponseHypothesis]) -> Finding:
     """A note where the images are measured by the other response, else a warning."""
     subject, facts = one.hypothesis.subject, {**one.hypothesis.facts, "log_odds": one.log_odds}
     if decide([one]):
-        return note("image.response", subject, **facts, odds=round(exp(OPTIONS.act)))
+        return note("image.response", subject, **facts, odds=round(exp(HYPOTHESIS_THRESHOLDS.act)))
     return doubtful("image.response_unknown", subject, **facts)
 
 
@@ -175,7 +175,9 @@ def responses_by_edges(
         level = EvidenceLevel[ResponseHypothesis]("edges", lambda _, ratio=ratio: np.array([ratio]))
         one = other_response(_entries(session, usual[camera]), camera[1])
         ranked += posterior([one], [level])
-    return ResponseComparison(tuple(one for one in ranked if one.log_odds > -OPTIONS.report))
+    return ResponseComparison(
+        tuple(one for one in ranked if one.log_odds > -HYPOTHESIS_THRESHOLDS.report)
+    )
 
 
 def _entries(session: Session, images: Sequence[StationImages]) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ from pkmcal.observe.image_batches import placed_at
 from pkmcal.observe.repeats import combine_repeats
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.outcome.finding import Finding, wrong
-from pkmcal.outcome.hypotheses import OPTIONS, Explanation
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS, Explanation
 from pkmcal.session.load import Session
 from pkmcal.wording import how_often
 
@@ -37,7 +37,7 @@ OFFSET_DIRECTIONS = 8
 """Number of directions of the shift, evenly spaced; the p-value is that of one more draw."""
 
 
-def explain_images(case: Case, turns: RefinementResult | None, seed: int) -> Explanation:
+def explain_chance_matches(case: Case, turns: RefinementResult | None, seed: int) -> Explanation:
     """Mistake that explains the images of stations on tripods whose edges may be chance matches.
 
     The localization of such stations may be wrong, so their images are compared with the hypotheses
@@ -60,7 +60,7 @@ def explain_images(case: Case, turns: RefinementResult | None, seed: int) -> Exp
     # that a station was not localized is in the verdict, and the report shows why
     if not isinstance(error, InputError) or error.code == "station.not_recognised":
         return Explanation()
-    return Explanation(error, OPTIONS.report)
+    return Explanation(error, HYPOTHESIS_THRESHOLDS.report)
 
 
 class _Offered(NamedTuple):

@@ -363,7 +363,11 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
 
 
 def with_discrepancy(estimate: Estimate, discrepancy: Discrepancy) -> Estimate:
-    """Estimate whose covariances contain the discrepancy."""
+    """Estimate whose covariances contain the discrepancy.
+
+    From heights alone, the standard deviation of the result is not by these covariances:
+    :func:`pkmcal.identify.bed.bed_of` takes the discrepancy's columns instead, in a wider model.
+    """
     if not discrepancy.scales:
         return estimate
     problem = estimate.problem.problem
@@ -390,9 +394,9 @@ def bed_surface(
     felt, poses = height_rows(measurements), measurements.poses
     heights = [
         np.zeros((len(felt), column.count)) if column.poses is None else column.poses[felt, 5]
-        for column in discrepancy.random
+        for column in discrepancy.columns
     ]
-    by = np.concatenate(heights, axis=1) @ prior_root(discrepancy.random)
+    by = np.concatenate(heights, axis=1) @ prior_root(discrepancy.columns)
     place = estimate.state.T_base_platform[poses.configuration[felt], :2, 3]
     variance = np.einsum("ni,ij,nj->n", by, discrepancy.covariance, by)
     return BedSurface(

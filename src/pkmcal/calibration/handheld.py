@@ -48,6 +48,7 @@ from pkmcal.geometry.rigid import angle_between, inverse
 from pkmcal.identify.bundle import MarginalPrior
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Measurements
+from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.background import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.distance_tables import distance_tables
@@ -64,16 +65,11 @@ from pkmcal.observe.pose_candidates import SAME_POSE_TURN, same_pose
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.outcome.finding import Finding, note
-from pkmcal.outcome.hypotheses import OPTIONS as DECISIONS
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS
 from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, listed
-
-EDGES_DISAGREE_REASON = "too few of its edges agree with the other images"
-"""Reason for rejecting an image with a certain pose whose edges the joint estimate rejects."""
-CAMERA_TURNED_REASON = "all images together turn its camera by more than ten degrees"
-"""Reason for rejecting an image that has a single candidate pose and does not belong there."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +77,7 @@ class HandheldOptions:
     """Constants of the localization of hand-held images."""
 
     # largest probability that any image of a session is accepted with a wrong pose (statistical)
-    misplaced: float = math.exp(-DECISIONS.report)
+    misplaced: float = math.exp(-HYPOTHESIS_THRESHOLDS.report)
     # number of an image's best poses that are always scored again when the machine is known better,
     # whatever their score by the image alone, because a wrong pose corrupts the estimate
     scored_again: int = 4
@@ -109,6 +105,24 @@ class HandheldOptions:
 
 
 _OPTIONS = HandheldOptions()
+
+EDGES_DISAGREE_REASON = "too few of its edges agree with the other images"
+"""Reason for rejecting an image with a certain pose whose edges the joint estimate rejects."""
+CAMERA_TURNED_REASON = (
+    "all images together turn its camera by more than"
+    f" {brief(math.degrees(_OPTIONS.most_turn))} degrees"
+)
+"""Reason for rejecting an image that has a single candidate pose and does not belong there."""
+
+
+def few_legs_reason(machine: Machine) -> str:
+    """Reason for rejecting an image with a certain pose at which too few legs can be measured."""
+    return f"fewer than {_fewest_legs(machine)} legs can be measured at its pose"
+
+
+def _fewest_legs(machine: Machine) -> int:
+    """Smallest number of legs of an image that determine its pose."""
+    return min(_OPTIONS.fewest_legs, machine.n_legs)
 
 
 @dataclass(frozen=True)
@@ -177,7 +191,9 @@ def localize(
         )
         nowhere = {k for k in places if np.isnan(scene.T_camera_base[k]).any()}
         sure = _sure(places, len(places))
-        lost = {k: EDGES_DISAGREE_REASON if k in sure else why_lost(places[k]) for k in nowhere}
+        # an image with a certain pose has none in the scene if too few legs were measured there
+        few_legs = few_legs_reason(scene.machine)
+        lost = {k: few_legs if k in sure else why_lost(places[k]) for k in nowhere}
         for k in sorted(places.keys() & scene.edges.keys()):
             turn = angle_between(scene.T_camera_base[k], places[k].T_camera_base[0])
             if turn > _OPTIONS.most_turn and k in sure:
@@ -275,7 +291,7 @@ def _searched(
         rest = part(progress, 0.75, 1)
         for _ in range(_OPTIONS.most_rounds):
             T = accepted_poses()
-            unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
+            unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.with_few_legs]
             if not so_far.placed or not unsure:
                 break
             placed = len(by_hand) - len(unsure)
@@ -318,7 +334,7 @@ def _final_poses(so_far: _LocalizationState, T_camera_base: Array, by_hand: Sequ
     for k in by_hand:
         if k in so_far.scene.edges and not np.isnan(out[k]).any():
             out[k] = so_far.scene.T_camera_base[k]
-        elif k in so_far.bare:
+        elif k in so_far.with_few_legs:
             out[k] = np.nan
     return out
 
@@ -345,14 +361,14 @@ class _LocalizationState(NamedTuple):
     scene : with the machine estimated so far.
     placed : images with accepted poses.
     landmarks : background points of these images.
-    bare : images in which too few legs can be measured at their assumed pose.
+    with_few_legs : images in which too few legs can be measured at their assumed pose.
     failure : why the last accepted images could not be estimated together with the others.
     """
 
     scene: PriorScene
     placed: Mapping[int, Neighbour] = MappingProxyType({})
     landmarks: Mapping[int, Landmarks] = MappingProxyType({})
-    bare: frozenset[int] = frozenset()
+    with_few_legs: frozenset[int] = frozenset()
     failure: str = ""
 
 
@@ -396,17 +412,17 @@ def _with_sure(
     try:
         joined = register_images(session, images, scene, new, boards)
         # silhouettes match anywhere, legs can be measured at the correct pose only
-        bare = frozenset(
+        with_few_legs = frozenset(
             k
             for k in new
             if session.stations[k].handheld
             and k not in boards.stations
-            and _too_few_edges(joined, images[k])
+            and _too_few_legs(joined, images[k])
         )
-        if bare == new.keys():
-            return so_far._replace(bare=bare) if bare != so_far.bare else so_far
-        if bare:  # the others again, from where they are now
-            rest = {k: edges for k, edges in joined.edges.items() if k not in bare}
+        if with_few_legs == new.keys():
+            return so_far._replace(with_few_legs=with_few_legs)
+        if with_few_legs:  # the others again, from where they are now
+            rest = {k: edges for k, edges in joined.edges.items() if k not in with_few_legs}
             joined = register_images(session, images, joined._replace(edges=rest), {}, boards)
         scene = joined
     except PkmcalError as error:
@@ -416,15 +432,15 @@ def _with_sure(
     for k in sorted(scene.edges):
         p, T = images[k], scene.T_camera_base[k]
         placed[k] = Neighbour(p.camera, T, _legs(session, p, scene, T)[0])
-    return _LocalizationState(scene, placed, room.landmarks(placed), bare)
+    return _LocalizationState(scene, placed, room.landmarks(placed), with_few_legs)
 
 
-def _too_few_edges(scene: PriorScene, image: StationImages) -> bool:
+def _too_few_legs(scene: PriorScene, image: StationImages) -> bool:
     """Whether too few legs can be measured in an image at its pose."""
     p, machine = image, scene.machine
     T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
     visible = np.unique(legs.measure(p, machine, T, poses).edges.leg)
-    return len(visible) < min(_OPTIONS.fewest_legs, machine.n_legs)
+    return len(visible) < _fewest_legs(machine)
 
 
 def _alone(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
@@ -612,7 +628,7 @@ def inconsistent_poses(
     visible = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
     used = measured & (estimate.edge_weights >= INLIER_WEIGHT)
     visible[station[used], measurements.edges.leg[used]] = True
-    few = visible.sum(axis=1) < min(_OPTIONS.fewest_legs, session.machine.n_legs)
+    few = visible.sum(axis=1) < _fewest_legs(session.machine)
     lost = ((2 * inliers < count) | (inliers < _OPTIONS.fewest_edges) | few) & ~by_board
     return {
         k: EDGES_DISAGREE_REASON if lost[k] else CAMERA_TURNED_REASON

@@ -26,7 +26,7 @@ from pkmcal.cameras.files import written_camera
 from pkmcal.identify.score import ScoreTests
 from pkmcal.measurements import Column
 from pkmcal.outcome.finding import Finding, doubtful, note
-from pkmcal.outcome.hypotheses import OPTIONS, Hypothesis, Ranked, decide
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS, Hypothesis, Ranked, decide
 from pkmcal.session.load import Session
 
 USUAL_CENTRE_ERROR = 1.5
@@ -69,7 +69,7 @@ def rotation_finding(one: Ranked[UpsideDown]) -> Finding:
         "image.upside_down",
         file,
         **facts,
-        odds=round(exp(OPTIONS.act)),
+        odds=round(exp(HYPOTHESIS_THRESHOLDS.act)),
         centre_x=x,
         centre_y=y,
         written=written_camera(file),
@@ -102,7 +102,7 @@ def upside_down(session: Session, turns: RefinementResult) -> tuple[Ranked[Upsid
         file_sigma = _file_sigma(camera)
         alone = [_log_odds(value[[k]], sigma[[k]], file_sigma) for k in range(len(own))]
         odds = _log_odds(value, sigma, file_sigma)
-        if odds > OPTIONS.report and min(alone) > -OPTIONS.report:
+        if odds > HYPOTHESIS_THRESHOLDS.report and min(alone) > -HYPOTHESIS_THRESHOLDS.report:
             names = [list(cameras)[k] for k in own]
             hypothesis = upside_down_images(file, names, camera.turned_by_half())
             out.append(Ranked(hypothesis, odds, "score"))

@@ -24,7 +24,7 @@ from pkmcal.mechanisms.reading_hypotheses import (
     renumbered_legs,
 )
 from pkmcal.outcome.finding import Finding, note
-from pkmcal.outcome.hypotheses import OPTIONS, EvidenceLevel, posterior
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS, EvidenceLevel, posterior
 from pkmcal.session.load import Session
 from pkmcal.wording import in_full
 
@@ -50,7 +50,9 @@ def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
     level = EvidenceLevel("nominal model", partial(_expected_ratios, machine, readings))
     # with two motors, counting from the other one exchanges them
     ranked = posterior(renumbered_legs(m) or exchanged_motors(m), [level])
-    orders = [one.hypothesis.facts["order"] for one in ranked if one.log_odds > -OPTIONS.act]
+    orders = [
+        one.hypothesis.facts["order"] for one in ranked if one.log_odds > -HYPOTHESIS_THRESHOLDS.act
+    ]
     return tuple(sorted(orders, key=lambda order: order[0]))
 
 

@@ -24,7 +24,7 @@ from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_error, reversed_motor
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.hypotheses import SuspectStation, mistake
+from pkmcal.observe.hypotheses import SuspectStation, image_mistake
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, fitting
 from pkmcal.observe.pose_likelihood import StationView
@@ -370,7 +370,7 @@ def mistake_in(
     still = frozen_in(session)
     if still is not None and not leg_localization.complete:  # an error in any case, and cheaper
         return still
-    error = mistake(suspect_stations(session, images, leg_localization), rng)
+    error = image_mistake(suspect_stations(session, images, leg_localization), rng)
     return error and (still or error)
 
 
@@ -467,9 +467,9 @@ def locate_stations(
         # base
         value = localize_by_legs(session, images, poses, rngs[1:], boards, start_poses)
         progress("Testing hypotheses about the images", 0.8)
-        mixed_up = mistake_in(session, images, value, rngs[0])
-        if mixed_up is not None:
-            return StationSearch(value, start_poses, mixed_up)
+        mistake = mistake_in(session, images, value, rngs[0])
+        if mistake is not None:
+            return StationSearch(value, start_poses, mistake)
         start_poses[[p.station for p in images]] = [
             pose.T_camera_base for pose in value.localizations
         ]

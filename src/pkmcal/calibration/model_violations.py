@@ -115,13 +115,13 @@ class ModelViolations(NamedTuple):
     violations : named violations, the smallest p-value first.
     errors : components of the model discrepancy.
     estimate : estimate whose covariance contains the discrepancy.
-    random : columns of the discrepancy.
+    discrepancy_columns : of the discrepancy, with their estimated priors.
     """
 
     violations: tuple[DetectedViolation, ...]
     errors: tuple[ModelError, ...]
     estimate: Estimate
-    random: tuple[Column, ...]
+    discrepancy_columns: tuple[Column, ...]
 
 
 def model_violations(
@@ -155,7 +155,7 @@ def model_violations(
         candidates.detections(tests, scores, tool),
         model_errors(discrepancy, tool, before, unit, surface),
         estimate,
-        discrepancy.random,
+        discrepancy.columns,
     )
 
 
@@ -240,7 +240,7 @@ class _Candidates:
                 only_heights(self.estimate),
             )
             beside = discrepancy.scales and alone[1]
-            tests, scores = self.scored(discrepancy.random) if beside else alone
+            tests, scores = self.scored(discrepancy.columns) if beside else alone
             # a rival that is no violation beside the discrepancy must have no part in it
             if scores.keys() >= set(rivals):
                 return tests, scores, discrepancy

@@ -159,7 +159,7 @@ def _explained(
     hypotheses = [
         *_wrong_readings(measured, joints, k),
         *(_other_row(k, int(c)) for c in range(len(joints)) if c != k),
-        *(_exchanged(k, int(c)) for c in odd if c != k),
+        *(_both_misnamed(k, int(c)) for c in odd if c != k),
     ]
     prior = -log(len(hypotheses))
     ranked = posterior(
@@ -220,7 +220,7 @@ def _other_row(k: int, other: int) -> ReadingHypothesis:
     return ReadingHypothesis("configurations.misnamed", f"as {other}", apply, facts={"like": other})
 
 
-def _exchanged(k: int, other: int) -> ReadingHypothesis:
+def _both_misnamed(k: int, other: int) -> ReadingHypothesis:
     """Hypothesis that two configurations are exchanged. Facts: ``partner``, the other."""
 
     def apply(joints: Array) -> Array:

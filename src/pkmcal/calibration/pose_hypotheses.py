@@ -48,8 +48,8 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.outcome.hypotheses import (
+    HYPOTHESIS_THRESHOLDS,
     NO_ESTIMATE,
-    OPTIONS,
     EvidenceLevel,
     Explanation,
     Hypothesis,
@@ -292,11 +292,13 @@ def diagnose(
         return Diagnosis()  # poses of boards on the base alone
     evidence = PoseEvidence(machine, measurements, min(pose_misfit(estimate), richer_misfit))
     hypotheses = pose_hypotheses(machine, measurements, estimate)
-    if evidence.null_misfit <= evidence.harmless(hypotheses, OPTIONS.report):
+    if evidence.null_misfit <= evidence.harmless(hypotheses, HYPOTHESIS_THRESHOLDS.report):
         return Diagnosis()
     levels = (
         # residuals contain nominal errors, so closure discards hypotheses but confirms none
-        EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most),
+        EvidenceLevel(
+            "closure", evidence.by_closure, decides=False, most=HYPOTHESIS_THRESHOLDS.most
+        ),
         evidence.by_estimate,
     )
     return evidence.diagnosis(posterior(hypotheses, levels))
@@ -317,19 +319,21 @@ def diagnose_by_closure(
     unit : as returned by :func:`nominal_misfit`.
     """
     evidence = PoseEvidence(machine, measurements, misfit, unit)
-    closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
+    closure = EvidenceLevel(
+        "closure", evidence.by_closure, decides=False, most=HYPOTHESIS_THRESHOLDS.most
+    )
     single = reading_mistakes(machine, measurements)
     contradicted = misfit > options.most_nominal_error * unit
     for number in (1, 2):
         # a decision here replaces the estimate from the data as stated, so it needs log-odds of
         # ``act``
-        if misfit <= evidence.harmless(single, OPTIONS.act, number) * unit:
+        if misfit <= evidence.harmless(single, HYPOTHESIS_THRESHOLDS.act, number) * unit:
             break
         hypotheses = single if number == 1 else [*_pairs(single, measurements)]
         closing = [
             one.hypothesis
             for one in posterior(hypotheses, [closure])
-            if one.log_odds > OPTIONS.act
+            if one.log_odds > HYPOTHESIS_THRESHOLDS.act
             and evidence.misfits[id(one.hypothesis)] < options.most_nominal_error
         ]
         diagnosis = evidence.diagnosis(posterior(closing, [evidence.by_confirmation]))
@@ -667,7 +671,7 @@ def explain_closure(
     machine, few = session.machine, spread_over(measurements, options.configurations)
     (misfit,) = closure_misfits(machine, [few]).tolist()
     least = PoseEvidence(machine, measurements, misfit).harmless(
-        reading_mistakes(machine, measurements), OPTIONS.act
+        reading_mistakes(machine, measurements), HYPOTHESIS_THRESHOLDS.act
     )
     unit = nominal_misfit(machine, few, np.random.default_rng(0), misfit / least, options)
     if misfit <= least * unit:

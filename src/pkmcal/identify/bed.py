@@ -91,10 +91,10 @@ def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
     return poses, by, _less(by[:, 2] - np.einsum("i,nip->np", slope, by[:, :2]), plane)
 
 
-def bed_of(estimate: Estimate, uneven: Sequence[Column]) -> Bed:
+def bed_of(estimate: Estimate, discrepancy_columns: Sequence[Column]) -> Bed:
     """Accuracy over the bed of an estimate from heights alone.
 
-    uneven : columns of the estimated model discrepancy.
+    discrepancy_columns : of the estimated model discrepancy, which is an uneven bed.
     """
     machine = estimate.machine
     poses, by, height = _bent(estimate)
@@ -110,7 +110,7 @@ def bed_of(estimate: Estimate, uneven: Sequence[Column]) -> Bed:
     middle, state = poses[0], estimate.state
     there = state.T_camera_base[0] @ middle @ state.T_mount[0]
     nominal = _nominal_root(machine, by)
-    off, root = _wider(estimate, nominal, uneven)
+    off, root = _wider(estimate, nominal, discrepancy_columns)
     return Bed(
         radius=float(np.linalg.norm(xy, axis=1).max()),
         sigma=_deviation(height, off, root, len(xy)),
@@ -165,14 +165,16 @@ def _nominal_root(machine: Machine, by: Array) -> Array:
     return np.column_stack([free, wide[:, own > ROUNDING * np.linalg.norm(shifted, axis=0)]])
 
 
-def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tuple[Array, Array]:
+def _wider(
+    estimate: Estimate, nominal: Array, discrepancy_columns: Sequence[Column]
+) -> tuple[Array, Array]:
     """Estimate of the parameters in the wider model: difference (P,) to the estimate, and a root
     (P, m) of the covariance.
 
     nominal : (P, m) root of the prior covariance of the varying parameters.
-    uneven : columns of the bed's unevenness.
+    discrepancy_columns : of the bed's unevenness.
     """
-    rows, remainder = _rows_beside(estimate, uneven)
+    rows, remainder = _rows_beside(estimate, discrepancy_columns)
     table = estimate.machine.parameters
     n, m = nominal.shape
     # the estimate, in deviations of the nominal model; a flat bed
@@ -188,7 +190,7 @@ def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tupl
     return nominal @ best[:m], nominal @ half[:m]
 
 
-def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, Array]:
+def _rows_beside(estimate: Estimate, discrepancy_columns: Sequence[Column]) -> tuple[Array, Array]:
     """Information of the heights on all P parameters and the l random effects.
 
     Returns rows (r, P + l), by parameters in m and rad and by effects in their prior sigmas, and
@@ -196,8 +198,8 @@ def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, A
     """
     assembled, info = estimate.linearized
     problem, state = info.problem.opened(info.state)
-    columns = columns_of(replace(assembled, problem=problem), state, uneven)
-    root = prior_root(uneven)
+    columns = columns_of(replace(assembled, problem=problem), state, discrepancy_columns)
+    root = prior_root(discrepancy_columns)
     machine, count = problem.unknowns.columns("machine"), problem.unknowns.count
     parts: list[tuple[Array, Array]] = []
     for cut, piece in zip(problem.cuts, Information(problem, state).pieces(), strict=True):

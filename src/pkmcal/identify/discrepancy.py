@@ -146,14 +146,14 @@ class Discrepancy:
 
     scales : detected components, in the order of their selection.
     shared : (na, na) addition to the covariance of the shared unknowns.
-    random : columns of the components, with their estimated priors.
+    columns : of the components, with their estimated priors.
     mean, covariance : (l,) and (l, l), posterior of the coefficients in prior standard deviations.
     sure : whether the components explain the data significantly better than larger noise does.
     """
 
     scales: tuple[ComponentScale, ...]
     shared: Array
-    random: tuple[Column, ...]
+    columns: tuple[Column, ...]
     mean: Array
     covariance: Array
     sure: bool = False
@@ -257,8 +257,8 @@ def discrepancy_of(
     mean, covariance = mean[unnamed], covariance[np.ix_(unnamed, unnamed)]
     spread = gain @ (np.outer(mean, mean) + covariance) @ gain.T
     by_code = {one.code: one.column for one in components}
-    random = tuple(replace(by_code[one.code], prior=one.scale * one.root) for one in scales)
-    return Discrepancy(scales, spread, random, mean, covariance, sure)
+    columns = tuple(replace(by_code[one.code], prior=one.scale * one.root) for one in scales)
+    return Discrepancy(scales, spread, columns, mean, covariance, sure)
 
 
 class _Search:

@@ -59,7 +59,7 @@ from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm, Search
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.measurements import Column
-from pkmcal.outcome.hypotheses import OPTIONS, parameter_cost
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS, parameter_cost
 from pkmcal.solver.elimination import Linear, eliminate
 from pkmcal.solver.ranks import inverse_root
 
@@ -213,7 +213,7 @@ class ScoreTests:
         def likely() -> list[tuple[float, int]]:
             scores = self.scores(others)
             odds = [one.chi2 / 2 + parameter_cost(one.dof, n) for one in scores]
-            least = max(odds[named] - OPTIONS.act, OPTIONS.report)
+            least = max(odds[named] - HYPOTHESIS_THRESHOLDS.act, HYPOTHESIS_THRESHOLDS.report)
             return sorted(((odds[k], k) for k in free if odds[k] > least), reverse=True)
 
         for _, k in likely():

@@ -166,8 +166,9 @@ def identified(machine: Machine, covariance: Array) -> Booleans:
 
     The others are conventions or starting values, and are not reported. A number is determined if
     its standard deviation is below half of its prior scale: the machine's size for positions, one
-    radian
-    for rotations. covariance : (..., 6, 6), rad and m.
+    radian for rotations.
+
+    covariance : (..., 6, 6) of poses by (omega, tau), rad and m.
     """
     sigma = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 0.0))
     return sigma < MAJORITY * np.repeat([1.0, machine_size(machine)], 3)

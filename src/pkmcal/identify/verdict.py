@@ -328,6 +328,11 @@ def misfit(
     """Findings on measurements that the model does not explain, that scatter more than stated, or
     of which many are rejected, by groups of rows with one noise scale.
 
+    A noise scale above ``too_noisy`` (UNEXPLAINED_SCALE) and a share of rejected measurements above
+    ``too_many_rejected`` are reasons against the result. A noise scale above the largest one that
+    is usual with the group's degrees of freedom is a warning
+    (:meth:`~pkmcal.identify.false_alarm.FalseAlarm.usual_scale`).
+
     labels : names of the measurements in a group, in the plural; the group's own by default.
     richer : the model that explains the poses. without : groups that are judged otherwise.
     """

@@ -32,7 +32,7 @@ from pkmcal.judge.causes import (
 from pkmcal.judge.fixed_machine import Evidence
 from pkmcal.levels import MAJORITY, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
-from pkmcal.outcome.hypotheses import OPTIONS
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS
 from pkmcal.ranges import default
 
 CHANGE_ALPHA: float = default("watch", "alpha")
@@ -41,7 +41,7 @@ DETECTION_POWER = 0.9
 """Probability with which a detectable change is detected."""
 WATCH_NOISE_DRAWS = 20_000
 """Number of draws of noise: a share of 0.01 of them is known to a relative 7 %."""
-DISTINCT_LOG_ODDS = 2 * OPTIONS.act
+DISTINCT_LOG_ODDS = 2 * HYPOTHESIS_THRESHOLDS.act
 """Twice the log-odds, nats, from which one cause excludes another."""
 MOST_CAUSES = 4
 """Maximum number of changes that are identified; more occur in a machine that was taken apart."""

@@ -62,7 +62,6 @@ class MeasurementKind(ABC):
     unit : unit of the numbers.
     numbers : largest number of residuals of one measurement.
     rows : group of the residuals, which has one noise scale.
-    joins : number of configurations on which one measurement depends.
     default_sigma : standard deviation where a session states none, in ``unit``; None where it has
         to be stated.
     own_sigma : source of the standard deviation of a user's own instrument, in words.
@@ -74,7 +73,6 @@ class MeasurementKind(ABC):
     unit: ClassVar[Literal["px", "m", "rad", "m or rad"]]
     numbers: ClassVar[int]
     rows: ClassVar[Literal["edges", "poses", "readings", "links"]]
-    joins: ClassVar[int] = 1
     default_sigma: ClassVar[float | None] = None
     own_sigma: ClassVar[str] = ""
 
@@ -169,6 +167,10 @@ class LinkKind(MeasurementKind, ABC):
     is estimated with the machine. All kinds of links share one noise scale, which is estimated if
     the residuals are larger than stated.
 
+    The number of configurations is fixed: the table (:class:`~pkmcal.files.PairTable`), the
+    derivatives (:class:`~pkmcal.measurements.links.LinkRows`), the columns of the problem
+    (:mod:`pkmcal.identify.link_rows`), rejections and reports are those of two.
+
     key, schema : of session.yaml.
     """
 
@@ -176,7 +178,6 @@ class LinkKind(MeasurementKind, ABC):
     schema: ClassVar[type[Schema]]
     numbers: ClassVar = 1
     rows: ClassVar = "links"
-    joins: ClassVar = 2
 
     @classmethod
     @abstractmethod

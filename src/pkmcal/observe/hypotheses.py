@@ -48,7 +48,7 @@ from pkmcal.observe.station_localization import (
     likelihood_nearby,
 )
 from pkmcal.outcome.hypotheses import (
-    OPTIONS,
+    HYPOTHESIS_THRESHOLDS,
     EvidenceLevel,
     Hypothesis,
     HypothesisOptions,
@@ -161,14 +161,14 @@ class ImageHypothesis(Hypothesis[StationView]):
     readings: Array | None = None
 
 
-def mistake(
+def image_mistake(
     stations: list[SuspectStation],
     rng: np.random.Generator,
     options: ImageEvidenceOptions = IMAGE_EVIDENCE,
 ) -> InputError | None:
     """Error about stations whose images disagree with the session, None if all agree."""
     # exchanged stations
-    error = _swapped_stations([s for s in stations if s.elsewhere], rng)
+    error = _exchanged_stations([s for s in stations if s.elsewhere], rng)
     if error is not None or not stations:
         return error
     bad = [station for station in stations if not station.localization.good]
@@ -178,7 +178,7 @@ def mistake(
     )
     # a station that is localized near its pose by hand shows that the readings are in order
     in_order = any(s.by_hand is not None and not s.elsewhere for s in stations)
-    error = _mixed_up(worst, in_order, rng, options)
+    error = _likeliest_mistake(worst, in_order, rng, options)
     if error is not None:
         return error
     if not bad:  # readings are wrong for all stations, but names for one alone
@@ -222,7 +222,7 @@ def _little(station: SuspectStation) -> str:
     return f"{few}legs that readings of other configurations fit as well {often}"
 
 
-def _swapped_stations(
+def _exchanged_stations(
     stations: list[SuspectStation], rng: np.random.Generator
 ) -> InputError | None:
     """Error about two stations whose images are exchanged.
@@ -276,7 +276,7 @@ def _swapped_stations(
     return None
 
 
-def _mixed_up(
+def _likeliest_mistake(
     station: SuspectStation,
     in_order: bool,
     rng: np.random.Generator,
@@ -488,7 +488,7 @@ def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
                 f"{step:+d}",
                 lambda view, shifted=shifted: replace(view, configuration=shifted),
                 prior,
-                error=_shifted(step),
+                error=_shifted_images(step),
                 readings=view.all_joints[shifted],
             )
     # Legs of a few pixels' width fit almost as well with half the radius, and two images may prefer
@@ -553,7 +553,7 @@ def _other_images(
             station.name,
             lambda view: replace(view, tables=view.tables.mirrored()),
             prior,
-            error=_mirrored(station),
+            error=_mirrored_images(station),
         )
     if not 2 < len(names) == len(np.unique(names)):
         return
@@ -564,7 +564,7 @@ def _other_images(
     keep_evidence = (
         own.log_likelihood_ratio / (own.correlation_length * len(names)) if own.good else 0.0
     )
-    keeps = np.eye(len(names)) * own.correlation_length * (OPTIONS.act / 2 + choices)
+    keeps = np.eye(len(names)) * own.correlation_length * (HYPOTHESIS_THRESHOLDS.act / 2 + choices)
     for _ in range(NAMING_ROUNDS):  # names determine the pose, and the pose the names
         fits = log_likelihood_by_name(
             replace(view, configuration=names[columns]), T_camera_base, names
@@ -581,7 +581,7 @@ def _other_images(
             station.name,
             lambda view: replace(view, configuration=right),
             prior - len(shifted) * (choices + options.right_name_share * keep_evidence),
-            error=_misnamed(station, shifted, names[columns[shifted]]),
+            error=_exchanged_images(station, shifted, names[columns[shifted]]),
         )
 
 
@@ -598,7 +598,7 @@ def _best_names(score: Array) -> Integers:
     return linear_sum_assignment(-score)[1]
 
 
-def _shifted(step: int) -> InputError:
+def _shifted_images(step: int) -> InputError:
     return InputError(
         "the images are shifted against the readings",
         where="joints.csv",
@@ -610,7 +610,7 @@ def _shifted(step: int) -> InputError:
     )
 
 
-def _misnamed(station: SuspectStation, images: Integers, fitting: Integers) -> InputError:
+def _exchanged_images(station: SuspectStation, images: Integers, fitting: Integers) -> InputError:
     """Error about images, by index, that fit other rows of the readings."""
     files = [station.files[k] for k in images]
     fit = [station.configurations[k] for k in fitting]
@@ -623,7 +623,7 @@ def _misnamed(station: SuspectStation, images: Integers, fitting: Integers) -> I
     )
 
 
-def _mirrored(station: SuspectStation) -> InputError:
+def _mirrored_images(station: SuspectStation) -> InputError:
     if len(station.files) == 1:
         return InputError(
             f"this image of {station.name} is mirrored",

@@ -41,7 +41,7 @@ from pkmcal.observe.shadows import (
     lightness,
     without_shadows,
 )
-from pkmcal.outcome.hypotheses import OPTIONS
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS
 
 
 @dataclass(frozen=True)
@@ -145,11 +145,11 @@ class LocalizationOptions:
     early: float = 1e-4
     # probability of so large a likelihood by chance below which the machine is localized without a
     # prior (statistical)
-    false_alarm: float = math.exp(-OPTIONS.act)
+    false_alarm: float = math.exp(-HYPOTHESIS_THRESHOLDS.act)
     # the same near a hand-placed pose, which is evidence itself (statistical)
     false_alarm_with_prior: float = 1e-2
     # probability of a second pose above which neither is accepted (statistical)
-    rival: float = math.exp(-OPTIONS.report)
+    rival: float = math.exp(-HYPOTHESIS_THRESHOLDS.report)
     # grid of candidates without a prior
     candidates: CandidateOptions = CANDIDATE_OPTIONS
     # detection of shadows among the poses

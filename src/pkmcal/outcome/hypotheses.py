@@ -51,7 +51,7 @@ class HypothesisOptions:
     most: int = 6
 
 
-OPTIONS = HypothesisOptions()
+HYPOTHESIS_THRESHOLDS = HypothesisOptions()
 NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
 """Errors by which an estimate under a hypothesis fails."""
 
@@ -153,7 +153,7 @@ class Explanation(NamedTuple):
 def posterior(
     hypotheses: Sequence[Subject],
     levels: Sequence[EvidenceLevel[Subject]],
-    options: HypothesisOptions = OPTIONS,
+    options: HypothesisOptions = HYPOTHESIS_THRESHOLDS,
 ) -> list[Ranked[Subject]]:
     """Hypotheses that all levels of evidence retain, the likeliest first.
 
@@ -181,7 +181,7 @@ def posterior(
 
 
 def decide(
-    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
+    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = HYPOTHESIS_THRESHOLDS
 ) -> Ranked[Subject] | None:
     """Hypothesis to follow, None if none is likely enough for its action."""
     if not ranked:
@@ -197,11 +197,11 @@ def likely(ranked: Sequence[Ranked[Subject]]) -> list[Ranked[Subject]]:
     """
     first = decide(ranked)
     rivals = rivals_of(ranked) if first else []
-    return [one for one in (first, *rivals) if one and one.log_odds > OPTIONS.report]
+    return [one for one in (first, *rivals) if one and one.log_odds > HYPOTHESIS_THRESHOLDS.report]
 
 
 def rivals_of(
-    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
+    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = HYPOTHESIS_THRESHOLDS
 ) -> list[Ranked[Subject]]:
     """Rivals of the first of the ranked hypotheses: other explanations that it does not exclude,
     each once.
@@ -224,7 +224,7 @@ def refuse(*explanations: Callable[[], Explanation]) -> tuple[Finding, ...]:
     for explain in explanations:
         likeliest = max(likeliest, one := explain(), key=lambda one: one.log_odds)
         untested += one.untested
-        if likeliest.log_odds > OPTIONS.act:
+        if likeliest.log_odds > HYPOTHESIS_THRESHOLDS.act:
             break
     if likeliest.error is not None:
         raise likeliest.error
@@ -239,7 +239,7 @@ def parameter_cost(count: int, n_effective: float) -> float:
 
 
 def harmless_misfit(
-    n_effective: float, log_prior: float, log_odds: float = OPTIONS.report
+    n_effective: float, log_prior: float, log_odds: float = HYPOTHESIS_THRESHOLDS.report
 ) -> float:
     """Misfit of the data as stated (:func:`log_likelihood`) up to which no hypothesis is searched.
 

@@ -38,7 +38,7 @@ from pkmcal.report import (
     field,
     heights,
     identifiability,
-    linked,
+    link_measurements,
     parameters,
     pictures,
     poses,
@@ -165,7 +165,7 @@ def report_of(
         pictures.section(session, album) if session.stations else None,
         heights.section(session, c.heights),
         poses.section(session, observation, estimate),
-        *linked.sections(session, _links(c), estimate),
+        *link_measurements.sections(session, _links(c), estimate),
         held,
         bed.section(session, c.model_errors),
     )
@@ -475,7 +475,10 @@ def _data(
         for thing, weights, n, more in (
             ("edge", estimate.edge_weights, len(observation.edges) - coarse, beside),
             ("pose", estimate.pose_weights, len(estimate.pose_weights), ""),
-            *((one, part, len(part), "") for one, part in linked.weights(links, estimate)),
+            *(
+                (one, part, len(part), "")
+                for one, part in link_measurements.weights(links, estimate)
+            ),
         )
         if len(weights)
     ]

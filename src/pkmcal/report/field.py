@@ -30,7 +30,7 @@ from pkmcal.outcome.blocks import images as blocks
 from pkmcal.outcome.blocks.base import Key
 from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.corners import BoardCorners
-from pkmcal.report.links import Links
+from pkmcal.report.page_links import Links
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, number

@@ -37,7 +37,7 @@ from pkmcal.outcome.blocks import images as blocks
 from pkmcal.outcome.blocks.base import image_key
 from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.corners import BoardCorners, board_corners
-from pkmcal.report.links import Place
+from pkmcal.report.page_links import Place
 from pkmcal.report.residuals import outward_shift
 from pkmcal.report.strips import edge_lines, strips_of_image
 from pkmcal.session.image_files import Image
