@@ -34,7 +34,7 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.row_sums import GroupRows, group_rows
-from pkmcal.levels import FALSE_ALARM
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements.rows import RowGroups
 
 LEAST_NOISE_FREEDOM = 5.0
@@ -47,19 +47,17 @@ number."""
 class NoiseOptions:
     """Constants of the restricted likelihood of a noise."""
 
-    # probability of contradicting a noise that is stated correctly, shared by the three kinds of
-    # rows
-    contradiction_chance: float = FALSE_ALARM / 3
+    # probability of contradicting a noise that is stated correctly: one in a hundred, shared by the
+    # three kinds of rows
+    contradiction_chance: float = 0.01 / 3
     # largest factor on a noise in one step, beyond which the linear model no longer holds
     largest_step: float = 10.0
     # largest number of rows whose residuals are decorrelated together. More rows are handled in
     # groups of configurations: variances remain exact, but correlations between groups, which are
     # due to the few shared unknowns, are neglected
     largest_group: int = 400
-    # eigenvalue of M, the variance of a residual in units of the noise, below which the unknowns
-    # absorb the whole direction: a round's residuals are exact to 1e-3
-    # (BatchOptions.nearly_solved), so smaller ones are what the search has left
-    rounding: float = 1e-6
+    # eigenvalue of M below which it is rounding: the unknowns absorb the whole direction
+    rounding: float = 1e-10
     # grid of log s^2: its end to either side (the lower one stands for zero), and number of values
     largest_log_variance: float = 20.0
     variances: int = 41
@@ -185,13 +183,19 @@ class NoiseShares:
         """P-value (B,) of all noise being as stated, by the likelihood ratio against the best noise
         of this kind and of all others.
 
+        Directions in which the kind's own noise is negligible are left out: they show that of the
+        others, and contain what the prior alone determines.
+
         scale : (B,) factor on the kind's stated noise in use.
         """
         from scipy.special import chdtrc
 
-        variance = self.own / scale[:, None] ** 2 + self.others + self.fixed
-        stated = np.sum(np.log(variance) + self.z**2 / variance, axis=-1)
-        return chdtrc(2, np.maximum(stated - self._best[1], 0.0))
+        kept = self.own > NEGLIGIBLE * self.own.max(axis=1, keepdims=True, initial=0.0)
+        parts = (np.where(kept, part, 0.0) for part in (self.z, self.own, self.others))
+        shares = NoiseShares(*parts, np.where(kept, self.fixed, 1.0), self.options)
+        variance = shares.own / scale[:, None] ** 2 + shares.others + shares.fixed
+        stated = np.sum(np.log(variance) + shares.z**2 / variance, axis=-1)
+        return chdtrc(2, np.maximum(stated - shares._best[1], 0.0))
 
     @cached_property
     def _intervals(self) -> dict[float, tuple[Array, Array]]:
