@@ -143,15 +143,12 @@ def test_an_image_edge_is_evidence_for_one_of_two_legs_behind_each_other():
     a[:, 1], b[:, 1] = (eye + 1.02 * (end[:, 0] - eye) for end in (a, b))
     behind = replace(view, guessed=replace(apart, a=a, b=b, u=(b - a) / norm(b - a))[None])
     before, after = (
-        pose_likelihood.distances_under(
-            v, FRONT[None], np.arange(2), 8, visible=True
-        ).length.reshape(2, -1, 8)
-        > 0
+        pose_likelihood.coinciding_edges(v, FRONT[None], np.arange(2), 8).reshape(2, -1, 8)
         for v in (replace(view, guessed=apart[None]), behind)
     )
     leg = view.tubes.leg
-    assert np.mean(before[:, leg == 1]) > 0.5
-    assert not np.any(after[:, np.isin(leg, [0, 1])])
+    assert np.median(before[:, np.isin(leg, [0, 1])]) == 1
+    assert np.mean(after[:, np.isin(leg, [0, 1])] == 2) > 0.8
     assert np.array_equal(after[:, leg > 1], before[:, leg > 1])
 
 

@@ -32,6 +32,7 @@ from pkmcal.observe.distance_tables import (
     distance_tables,
 )
 from pkmcal.observe.image_batches import StationImages
+from pkmcal.observe.legs import EDGE_OPTIONS
 from pkmcal.observe.pose_candidates import (
     CANDIDATE_OPTIONS,
     CandidateOptions,
@@ -41,12 +42,13 @@ from pkmcal.observe.pose_candidates import (
 )
 from pkmcal.observe.pose_likelihood import (
     StationView,
+    distances_under,
     distinct_silhouettes,
-    log_likelihood_of,
+    mixture_of,
     refine_lm,
     refine_ml,
 )
-from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
+from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed, visible_stretch
 from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, TubeChart, TubeChartOptions, tube_chart
 
 
@@ -187,8 +189,8 @@ def localize_image(
     hypotheses = refine_lm(coarse, hypotheses, one, 4, options.next_reaches)
     hypotheses = _most(coarse, hypotheses, 5, options.on_finer)
     # maximum likelihood at twice the resolution
-    hypotheses, log_likelihood_ratio = refine_ml(fine, hypotheses, one, 8, 6)
-    hypotheses = hypotheses[np.argsort(-log_likelihood_ratio)]
+    hypotheses, _ = refine_ml(fine, hypotheses, one, 8, 6)
+    hypotheses = _most(fine, hypotheses, 8, options.on_finer)
     hypotheses = hypotheses[distinct_silhouettes(fine, hypotheses, one)][: options.on_finest]
     # and, with the symmetric poses of the best two, at four times
     weighed = weighed_poses(
@@ -213,7 +215,8 @@ def weighed_poses(
     """
     one = np.zeros(1, dtype=int)
     view = replace(view, tables=distance_tables([image], options.tables_at(4)))
-    values, log_likelihood_ratio = refine_ml(view, values, one, 16, 6)
+    values, _ = refine_ml(view, values, one, 16, 6)
+    log_likelihood_ratio = _log_likelihood(view, values, 16)
     order = np.argsort(-log_likelihood_ratio)
     order = order[log_likelihood_ratio[order] > 0]
     if not len(order):
@@ -370,9 +373,22 @@ def _starts_near(
 
 def _most(view: StationView, values: Array, samples: int, count: int) -> Array:
     """The ``count`` poses with the largest log-likelihood ratio."""
+    return values[np.argsort(-_log_likelihood(view, values, samples))[:count]]
+
+
+def _log_likelihood(view: StationView, values: Array, samples: int) -> Array:
+    """Log-likelihood ratios (H,) of poses (H, 4, 4) by the silhouettes that no other leg hides or
+    borders: with two legs on one line in the image, its edges would count twice.
+    """
     one = np.zeros(1, dtype=int)
-    log_likelihood_ratio = log_likelihood_of(view, values, one, samples)[:, 0]
-    return values[np.argsort(-log_likelihood_ratio)[:count]]
+    distances = distances_under(view, values, one, samples)
+    legs = view.legs(one).under(values)[:, 0]
+    points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
+    clear = unobstructed(
+        view.machine, view.camera, legs, view.tubes, points, EDGE_OPTIONS.clearance
+    )
+    distances = distances._replace(length=np.where(clear, distances.length, 0.0))
+    return distances.log_likelihood(mixture_of(distances, view.options)).sum(axis=(1, 2))
 
 
 class _Tubes(NamedTuple):
@@ -545,9 +561,9 @@ def symmetric_poses(
     """Poses (H n, 4, 4) of the machine rotated onto itself, from poses (H, 4, 4) and all n
     rotations.
 
-    The rotations are about the normal of the plane of the base joints, by the angles of the folds
-    that map every base joint close to another; a machine of equal parts looks nearly the same from
-    there.
+    The rotations are about the normal of the plane of the base joints, by the
+    angles of the folds that map every base joint close to another; a machine of equal parts looks
+    nearly the same from there.
     """
     machine = view.machine
     base = machine.base_centers()

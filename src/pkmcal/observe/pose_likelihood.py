@@ -18,10 +18,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import cross, of_components, perturb, pose, rotation
+from pkmcal.geometry.rigid import cross, dot, of_components, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.distance_tables import DISTANCE_TABLE_OPTIONS, DistanceTables
-from pkmcal.observe.legs import EDGE_OPTIONS
 from pkmcal.observe.predict import (
     EdgePoints,
     LegsInCamera,
@@ -31,7 +30,6 @@ from pkmcal.observe.predict import (
     normals_of_edges,
     of_edges,
     tubes_of,
-    unobstructed,
     visible_stretch,
 )
 from pkmcal.solver.marquardt import Damping
@@ -66,9 +64,9 @@ class LikelihoodOptions:
     # steps of expectation maximization of a mixture that is used afterwards; within a descent
     # three suffice, for the poses change too
     mixture_rounds: int = 10
-    # distance from the outlines of other legs within which an edge does not count: as in the
-    # measurement of edges, in full-size pixels
-    clearance: float = EDGE_OPTIONS.clearance
+    # angle within which two predicted edges have the same direction: they match the same edges in
+    # the distance tables
+    same_direction: float = np.pi / DISTANCE_TABLE_OPTIONS.directions
     # longest step of a pose, rad and m: the tables' slopes are valid nearby only
     longest_step: float = 0.1
 
@@ -426,9 +424,11 @@ def refine_ml(
         if max(last, most) < view.options.least_gain:
             break  # a single step may have been too long
         last = most
-    distances = distances_under(view, candidates, images, samples, visible=True)
-    mixture = mixture_of(distances, view.options, widest)
-    return candidates, _summed(distances.log_likelihood(mixture))
+    start = first_mixture(len(candidates), view.options)
+    rounds = view.options.mixture_rounds
+    mixture = linearization.distances.mixture(start, rounds, widest, view.options)
+    each = linearization.distances.log_likelihood(mixture)
+    return candidates, _summed(each / coinciding_edges(view, candidates, images, samples))
 
 
 def first_mixture(count: int, options: LikelihoodOptions = LIKELIHOOD_OPTIONS) -> _Mixture:
@@ -436,24 +436,17 @@ def first_mixture(count: int, options: LikelihoodOptions = LIKELIHOOD_OPTIONS) -
     return _Mixture(np.full(count, 0.5), np.full(count, options.last_reach / 2))
 
 
-def mixture_of(
-    distances: Distances,
-    options: LikelihoodOptions = LIKELIHOOD_OPTIONS,
-    widest: float | None = None,
-) -> _Mixture:
-    """Maximum-likelihood mixture of the distances of each hypothesis.
-
-    widest : as of :meth:`Distances.mixture`.
-    """
+def mixture_of(distances: Distances, options: LikelihoodOptions = LIKELIHOOD_OPTIONS) -> _Mixture:
+    """Maximum-likelihood mixture of the distances of each hypothesis."""
     start = first_mixture(len(distances.distance), options)
-    return distances.mixture(start, options.mixture_rounds, widest, options)
+    return distances.mixture(start, options.mixture_rounds, options=options)
 
 
 def log_likelihood_of(
     view: StationView, candidates: Array, images: Integers, samples: int
 ) -> Array:
-    """Log-likelihood ratio (H, K) of candidates (H, 4, 4) in each image, by visible edges."""
-    distances = distances_under(view, candidates, images, samples, visible=True)
+    """Log-likelihood ratio (H, K) of candidates (H, 4, 4) in each image."""
+    distances = distances_under(view, candidates, images, samples)
     mixture = mixture_of(distances, view.options)
     return by_image(distances.log_likelihood(mixture), len(images))
 
@@ -527,31 +520,42 @@ def _parts(view: StationView, count: int, places: int) -> list[slice]:
 
 
 def distances_under(
-    view: StationView, candidates: Array, images: Integers, samples: int, *, visible: bool = False
+    view: StationView, candidates: Array, images: Integers, samples: int
 ) -> Distances:
-    """Distances at the edges predicted from poses (H, 4, 4).
-
-    visible : set the length to 0 where another leg hides or borders an edge. Two legs behind each
-        other match one image edge; if it counted for both, a pose from which legs lie behind each
-        other would be likelier than the correct one.
-    """
+    """Distances at the edges predicted from poses (H, 4, 4)."""
     parts = _parts(view, len(candidates), len(images) * samples)
     if len(parts) > 1:
-        each = [
-            distances_under(view.guess(k), candidates[k], images, samples, visible=visible)
-            for k in parts
-        ]
+        each = [distances_under(view.guess(k), candidates[k], images, samples) for k in parts]
         return Distances(*map(np.concatenate, zip(*each, strict=True)))
-    legs, points, direction, number = _edges_under(view, candidates, images, samples)
+    points, direction, number = _edges_under(view, candidates, images, samples)
     distance, inside = view.tables.look_up(direction, points.pixel, number, between=True)
-    distances = _distances(view, points, direction, distance, inside & points.valid)
-    if not visible:
-        return distances
-    clear = unobstructed(
-        view.machine, view.camera, legs, view.tubes, points, view.options.clearance
-    )
-    length = np.where(clear.reshape(distances.length.shape), distances.length, 0.0)
-    return distances._replace(length=length)
+    return _distances(view, points, direction, distance, inside & points.valid)
+
+
+def coinciding_edges(view: StationView, candidates: Array, images: Integers, samples: int) -> Array:
+    """Number of predicted edges that coincide at each point (H, E, n), its own included.
+
+    Edges coincide on the same side of their legs, in the same direction, where the scatter of
+    silhouettes does not separate them. All of them match the same image edge, which is evidence for
+    one leg only. Otherwise a pose from which two legs lie behind each other would fit better than
+    the correct one.
+    """
+    parts = _parts(view, len(candidates), len(images) * samples * 2 * len(view.tubes))
+    if len(parts) > 1:
+        return np.concatenate(
+            [coinciding_edges(view.guess(k), candidates[k], images, samples) for k in parts]
+        )
+    points, _, _ = _edges_under(view, candidates, images, samples)
+    pixel, outward = points.pixel[..., None, :], points.outward[..., None, :]  # (H, K, E, n, 1, 2)
+    begin, middle = points.pixel[..., 0, :], points.outward[..., points.outward.shape[-2] // 2, :]
+    chord = points.pixel[..., -1, :] - begin
+    begin, chord, normal = (v[..., None, None, :, :] for v in (begin, chord, middle))
+    along = dot(pixel - begin, chord) / np.maximum(dot(chord, chord), 1e-9)
+    across = np.abs(dot(pixel - begin, normal))
+    beside = (along >= 0) & (along <= 1) & (across < view.options.apart * view.tables.scale)
+    coincides = beside & (dot(outward, normal) > np.cos(view.options.same_direction))
+    count = np.maximum(coincides.sum(axis=-1), 1)
+    return count.reshape(len(candidates), -1, samples).astype(np.float32)
 
 
 def linearize_distances(
@@ -564,7 +568,7 @@ def linearize_distances(
         distances, *rest = zip(*passes, strict=True)
         every = Distances(*map(np.concatenate, zip(*distances, strict=True)))
         return _Linearization(every, *map(np.concatenate, rest))
-    _, points, direction, number = _edges_under(view, candidates, images, samples)
+    points, direction, number = _edges_under(view, candidates, images, samples)
     distance, slope, inside = view.tables.look_along(
         direction, points.pixel, points.outward, number
     )
@@ -582,14 +586,12 @@ def linearize_distances(
 
 def _edges_under(
     view: StationView, candidates: Array, images: Integers, samples: int
-) -> tuple[LegsInCamera, EdgePoints, Integers, Integers]:
-    """Legs (H, K, L) and predicted edges (H, K, E, n), the edges' direction numbers, and the
-    images' numbers (K, 1, 1).
-    """
+) -> tuple[EdgePoints, Integers, Integers]:
+    """Predicted edges (H, K, E, n), their direction numbers, and the images' numbers (K, 1, 1)."""
     number = np.arange(len(view.configuration))[images][:, None, None]
     legs = view.legs(images).under(candidates)
     points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
-    return legs, points, view.tables.direction(points.outward), number
+    return points, view.tables.direction(points.outward), number
 
 
 def _distances(
