@@ -538,7 +538,9 @@ def coinciding_edges(view: StationView, candidates: Array, images: Integers, sam
     Edges coincide on the same side of their legs, in the same direction, where the scatter of
     silhouettes does not separate them. All of them match the same image edge, which is evidence for
     one leg only. Otherwise a pose from which two legs lie behind each other would fit better than
-    the correct one.
+    the correct one. To leave out whatever another leg hides or borders, as for single images
+    (:func:`~pkmcal.observe.image_localization.weighed_poses`), loses evidence of stations: a
+    mirrored hexapod is then taken for one numbered backwards.
     """
     parts = _parts(view, len(candidates), len(images) * samples * 2 * len(view.tubes))
     if len(parts) > 1:
