@@ -335,18 +335,16 @@ def test_four_cables_are_calibrated_where_a_tracker_measured_every_pose(tmp_path
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
-def test_poses_of_four_cables_that_scatter_more_than_stated_are_told(tmp_path):
+def test_readings_of_four_cables_that_scatter_more_than_stated_are_reported(tmp_path):
     four_cables(tmp_path / "s", 1)
     path = tmp_path / "s" / "session.yaml"
     text = path.read_text().replace("0.05 mm", "0.02 mm").replace("1.0e-4", "4.0e-5")
     path.write_text(text.replace("0.2 mm", "0.08 mm"), encoding="utf-8")
-    verdict = calibrate_session(tmp_path / "s").verdict
-    assert not verdict.usable
-    assert "data.misfit" in verdict.codes
+    assert "readings.noise" in calibrate_session(tmp_path / "s").verdict.codes
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_wrong_reading_of_four_cables_is_told(tmp_path, seed):
+def test_a_wrong_reading_of_four_cables_is_reported(tmp_path, seed):
     """Where a pose is rejected, nothing else determines two of its numbers."""
     _, readings, _ = four_cables(tmp_path / "s", seed)
     readings[4, 0] += 0.01

@@ -288,7 +288,7 @@ def test_a_camera_compares_its_views_and_models(camera):
 
 def test_lines_of_a_study_join_numbers_only(one_process):
     """Three numbers on a scale are joined; of two names every combination is shown once."""
-    result = study("3-rpr", ["configurations=4,5,6", "stations=1,2"], runs=2)
+    result = study("3-rpr", ["configurations=4,5,6", "stations=1,2"], runs=4)
     part = result.outcome.parts[0]
     (plot,) = plots_of(part)
     assert plot.name == "by-configurations"

@@ -596,7 +596,7 @@ def test_what_cannot_be_shown_is_reported_before(demo, session, tmp_path):
     assert done.code == 2
     assert done.err.startswith(f"Error: --port: the page cannot be served on port {port}")
     done = run("view", demo.session, "--calibration", tmp_path)
-    assert (done.code, "there is no calibration here" in done.err) == (2, True)
+    assert (done.code, "there is no calibration of this session" in done.err) == (2, True)
     assert run("view", tmp_path / "nowhere").code == 2
     names = load_session(session).configurations
     rows = [f"{name},0,0,0.3{k},1,0,0,0" for k, name in enumerate(names)]

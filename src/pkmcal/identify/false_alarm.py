@@ -62,6 +62,11 @@ class FalseAlarm:
         """
         return max(NOISE_EXCESS, self.scale(Search.NOISE, dof))
 
+    @property
+    def of_noise(self) -> float:
+        """Level of the test whether measurements scatter more than stated."""
+        return self.of_test(Search.NOISE, 1)
+
     def adjusted(
         self, search: Search, chance: Array | float, tests: Array | Integers | int
     ) -> Array:

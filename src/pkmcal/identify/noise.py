@@ -190,9 +190,11 @@ class NoiseShares:
         """
         from scipy.special import chdtrc
 
-        kept = self.own > NEGLIGIBLE * self.own.max(axis=1, keepdims=True, initial=0.0)
-        z, own, others = (np.where(kept, part, 0.0) for part in (self.z, self.own, self.others))
-        shares = NoiseShares(z, own, others, np.where(kept, self.fixed, 1.0), self.options)
+        informative = self.own > NEGLIGIBLE * self.own.max(axis=1, keepdims=True, initial=0.0)
+        z, own, others = (
+            np.where(informative, part, 0.0) for part in (self.z, self.own, self.others)
+        )
+        shares = NoiseShares(z, own, others, np.where(informative, self.fixed, 1.0), self.options)
         variance = shares.own / scale[:, None] ** 2 + shares.others + shares.fixed
         stated = np.sum(np.log(variance) + shares.z**2 / variance, axis=-1)
         return chdtrc(2, np.maximum(stated - shares._best[1], 0.0))

@@ -7,7 +7,7 @@ readings. The purpose is then their lengths at given poses, which a controller c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -140,7 +140,7 @@ class ToolAccuracy:
     by_parameters: Array
     parameters: Array
     off: Array
-    by_lengths: Array | None = None
+    by_lengths: Array | None = field(default=None, repr=False)
 
     __repr__ = short_repr
 

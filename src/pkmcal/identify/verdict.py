@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import negligible_shift
 from pkmcal.identify.tool import centres_and_tool, platform_sigma
@@ -348,7 +348,7 @@ def misfit(
             yield wrong("data.misfit", listed(names), **facts)
         # where other groups' noise makes most of the residuals, the factor alone proves nothing
         elif group.scale > SESSION_FALSE_ALARM.usual_scale(group.dof) and (
-            group.chance is None or group.chance < SESSION_FALSE_ALARM.of_test(Search.NOISE, 1)
+            group.chance is None or group.chance < SESSION_FALSE_ALARM.of_noise
         ):
             yield doubtful("data.scatter", listed(names), **facts)
         share, limit = float(np.mean(weights < INLIER_WEIGHT)), options.too_many_rejected
