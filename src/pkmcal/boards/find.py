@@ -23,7 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.circles import LEAST_WINDOW_RADIUS, circle_centres, find_circles
-from pkmcal.boards.saddles import is_large_enough, largest_block
+from pkmcal.boards.saddles import SADDLE_OPTIONS, is_large_enough, largest_block
 from pkmcal.levels import NEARLY_ALL
 from pkmcal.observe.images import narrowed
 from pkmcal.solver.marquardt import Damping
@@ -88,7 +88,7 @@ class BoardDetectionOptions:
     least_light: float = 0.1
     marker_contrast: float = 10.0
     # share of a square by which a corner may lie off the middle of its two neighbours' line
-    bend: float = 0.35
+    bend: float = SADDLE_OPTIONS.bend
 
 
 BOARD_DETECTION_OPTIONS = BoardDetectionOptions()

@@ -47,7 +47,8 @@ class SaddleOptions:
     # share of the nearer neighbour's distance by which two opposite ones may miss each other's
     # reflection: at the border of a very wide lens, squares grow by a half from one to the next
     growth: float = 0.6
-    # share of a square's side by which its fourth corner may miss the parallelogram of the others
+    # share of a square's side by which a corner may miss its place by its neighbours: that of the
+    # parallelogram of three others here, the middle between two in the whole board
     bend: float = 0.35
     # least cosine between the directions of light and dark quadrants of corners of a block
     least_cosine: float = 0.5

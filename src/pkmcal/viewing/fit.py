@@ -9,6 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
+from pkmcal.levels import OUTLIER_SIGMAS
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.image_localization import localize_image, localize_near, with_neighbours
 from pkmcal.observe.pose_likelihood import StationView
@@ -32,8 +33,6 @@ A search uses eight and verifies with the others, in about a second; `calibrate`
 """
 FEWEST_FITTED_TOGETHER = 2
 """Fewest images of which some can verify the pose that the others give."""
-PIN_SIGMAS = 3.0
-"""Standard deviations of a pinned joint's place beyond which a pose contradicts it."""
 LEAST_CHANCE_DISPLAYED = 1e-9
 """Probability below which no digits are displayed."""
 
@@ -64,7 +63,7 @@ class _PlacedJoints(NamedTuple):
         """
         # a leg's silhouettes allow it to slide along itself; the joints placed by hand do not
         off, at_start = (
-            np.maximum(distance - PIN_SIGMAS * sigma, 0.0)
+            np.maximum(distance - OUTLIER_SIGMAS * sigma, 0.0)
             for distance, sigma in (
                 pin_distances(self.content, self.request, T) for T in (T_camera_base, self.start)
             )
