@@ -67,7 +67,7 @@ from pkmcal.observe.image_localization import (
     symmetric_poses,
 )
 from pkmcal.observe.images import decode
-from pkmcal.observe.pose_likelihood import StationView, log_likelihood_of
+from pkmcal.observe.pose_likelihood import StationView, likelihood_from
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, tube_chart
 from pkmcal.outcome import Verdict
@@ -926,13 +926,11 @@ def test_a_similar_pose_is_distinguished_by_the_machine_there(searched):
 
 
 def evidence_there(reference_values, view):
-    """Score of the third image's pose by the marginal prior."""
+    """Log-likelihood ratio of the third image about its pose by the marginal prior."""
     here = replace(
         view, machine=reference_values.machine, all_poses=reference_values.T_base_platform
     )
-    return log_likelihood_of(
-        here, reference_values.T_camera_base[[2]], np.zeros(1, dtype=int), 16
-    ).sum()
+    return likelihood_from(here, reference_values.T_camera_base[[2]])
 
 
 def test_images_join_what_is_known(searched):

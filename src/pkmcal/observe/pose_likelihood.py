@@ -442,15 +442,6 @@ def mixture_of(distances: Distances, options: LikelihoodOptions = LIKELIHOOD_OPT
     return distances.mixture(start, options.mixture_rounds, options=options)
 
 
-def log_likelihood_of(
-    view: StationView, candidates: Array, images: Integers, samples: int
-) -> Array:
-    """Log-likelihood ratio (H, K) of candidates (H, 4, 4) in each image."""
-    distances = distances_under(view, candidates, images, samples)
-    mixture = mixture_of(distances, view.options)
-    return by_image(distances.log_likelihood(mixture), len(images))
-
-
 def by_image(log_likelihood_ratio: Array, count: int) -> Array:
     """Sums (H, K) over the points of each image, or each configuration, from (H, E, n) in a row."""
     return log_likelihood_ratio.reshape(len(log_likelihood_ratio), count, -1).sum(
