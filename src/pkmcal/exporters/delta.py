@@ -146,6 +146,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
             f"mechanism {machine.name!r} gives no range for a motor, so its ends are not known",
             expected="range: [min, max] at every slider or crank",
             next_step="Add the ranges: the firmware's end switches are put at their upper ends",
+            code="export.no_range",
         )
     # motor position = rate * reading + zero, for the ideal machine
     linear = rods.drive[0] == SLIDE_CARRIER
@@ -192,6 +193,7 @@ def _no_delta(machine: Machine, program: str, text: str) -> InputError:
         found=text,
         expected="motion: translation with three sliders, or three cranks, and rods",
         next_step="Export it with --to c",
+        code="export.no_delta",
     )
 
 
@@ -251,6 +253,7 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
     if not usable.any():
         raise InputError(
             f"mechanism {machine.name!r} closes nowhere within its ranges",
+            code="export.no_workspace",
             next_step="Check the ranges in the mechanism file",
         )
     poses = poses[usable]
@@ -398,6 +401,7 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
             expected=f"at most {MOST_TOOL_ERROR:g} mm over the workspace",
             next_step="Set towers or arms nearer to the nominal model, or export the"
             " machine with --to c",
+            code="export.not_followed",
         )
     return fit
 

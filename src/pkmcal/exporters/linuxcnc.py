@@ -136,6 +136,7 @@ def _joints(
             found=", ".join(f"{value:.6g}" for value in readings),
             expected="readings within the ranges, which become LinuxCNC's limits",
             next_step="Give home: {position: [x, y, z]} in the mechanism file, or wider ranges",
+            code="export.home_outside_range",
         )
     kind = tuple("LINEAR" if machine.joint_units[k] == "m" else "ANGULAR" for k in columns)
     return Joints(kind, rate, offset, home, limits, scale)

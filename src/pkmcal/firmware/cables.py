@@ -29,6 +29,7 @@ def check_millimetres(longest: float, where: str) -> None:
             next_step="If these are metres, multiply them by 1000"
             if longest < LEAST_SIZE
             else None,
+            code="printer.units",
         )
 
 

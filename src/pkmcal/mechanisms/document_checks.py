@@ -292,4 +292,5 @@ def check_held(document: MechanismDocument, place: PlaceInDocument) -> None:
         f"{f' and its {listed(kinds)}' if kinds else ''}",
         next_step="Add legs or axes, or correct motion. Only a session in which a tracker measured"
         " every pose of the platform does without",
+        code="mechanism.not_held",
     )

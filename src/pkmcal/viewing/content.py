@@ -194,6 +194,7 @@ class SessionContent:
                 "there is no calibration of this session",
                 where=str(self._calibration or self.session.folder),
                 next_step="Run pkmcal calibrate, or name its folder with --calibration",
+                code="calibration.missing",
             )
         saved = load(self.calibration)
         # the same configurations with the same readings: otherwise poses belong to other images
@@ -204,6 +205,7 @@ class SessionContent:
                 where=str(saved.path),
                 expected=f"the configurations and readings of {self.session.folder}",
                 next_step="Calibrate again, or name another folder with --calibration",
+                code="calibration.another_session",
             )
         return saved
 
@@ -217,6 +219,7 @@ class SessionContent:
             raise InputError(
                 f"the calibration has no station {name}: it was left out, or added since",
                 where=str(self.saved.path),
+                code="calibration.no_station",
             )
         return names.index(name)
 

@@ -52,6 +52,7 @@ class PoseFile:
                     where=str(self._path),
                     next_step="Nothing was written. Start pkmcal view again, and put the machine"
                     " there once more",
+                    code="session.changed",
                 )
             entry = place_of(T_camera_base)
             text = with_numbers(
