@@ -69,7 +69,7 @@ from pkmcal.files import closest, quoted, resolved
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.conditions import conditions
 from pkmcal.identify.covariance import identifiability
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
@@ -77,7 +77,6 @@ from pkmcal.identify.unidentified import (
     explain,
     observed_by_boards,
     observed_legs,
-    only_heights,
 )
 from pkmcal.identify.verdict import RicherModel, assess
 from pkmcal.measurements import Column, Measurements, Observation
@@ -652,7 +651,7 @@ def _identification(
     values = identifiability(estimate.linearized.info, estimate.machine)
     counted = conditions(estimate.machine, observed) if len(measurements.edges) else ()
     bed: Bed | None = None
-    if only_heights(estimate):
+    if estimate.purpose is Purpose.HEIGHT:
         from pkmcal.identify.bed import bed_of
 
         bed = bed_of(estimate, discrepancy_columns)

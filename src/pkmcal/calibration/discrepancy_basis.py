@@ -22,12 +22,11 @@ from pkmcal.geometry.cylinders import contour_point, line_through
 from pkmcal.geometry.rigid import apply, dot, skew
 from pkmcal.identify.covariance import data_share, machine_covariance
 from pkmcal.identify.discrepancy import Component, Discrepancy
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.row_sums import POSE_ROWS, READING_ROWS
 from pkmcal.identify.score import prior_root
 from pkmcal.identify.tool import ToolAccuracy
-from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Column, Measurements
 from pkmcal.outcome.finding import Finding, doubtful
 
@@ -156,7 +155,7 @@ def uneven_bed(error: ModelError) -> Finding:
 def discrepancy_components(measurements: Measurements, estimate: Estimate) -> list[Component]:
     """All components that a session can have."""
     bed = _of_bed(measurements, estimate)
-    if only_heights(estimate):
+    if estimate.purpose is Purpose.HEIGHT:
         return bed
     return [*_of_readings(measurements, estimate), *_of_stations(measurements, estimate),
             *_of_legs(measurements, estimate), *bed]  # fmt: skip

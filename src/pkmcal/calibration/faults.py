@@ -16,9 +16,8 @@ from pkmcal.calibration.camera_refinement import CameraRefinement
 from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.start import start_state
-from pkmcal.identify.unidentified import only_heights
 from pkmcal.identify.verdict import VERDICT, RicherModel
 from pkmcal.levels import MAJORITY, NOISE_EXCESS, OUTLIER_SIGMAS
 from pkmcal.measurements import Measurements, PoseSet
@@ -168,7 +167,7 @@ def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
 
     Not for heights alone, which do not determine sizes.
     """
-    if only_heights(estimate):
+    if estimate.purpose is Purpose.HEIGHT:
         return
     scale = wrong_scale(estimate)
     if scale != 1.0 and estimate.pose_weights.size:

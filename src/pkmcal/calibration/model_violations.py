@@ -28,7 +28,7 @@ from pkmcal.calibration.discrepancy_basis import (
 from pkmcal.calibration.tube_outlines import Outline, outlines
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.discrepancy import Discrepancy, discrepancy_of
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.score import (
     MOST_VIOLATIONS_SOUGHT,
     OneStepUpdate,
@@ -36,7 +36,6 @@ from pkmcal.identify.score import (
     ScoreTests,
 )
 from pkmcal.identify.tool import ToolAccuracy, tool_error
-from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Column, Measurements, Observation
 from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms import machine_from_document
@@ -237,7 +236,7 @@ class _Candidates:
                 components,
                 [self.column(k) for k in rivals],
                 (statistics.reading_scale, statistics.pose_scale),
-                only_heights(self.estimate),
+                self.estimate.purpose is Purpose.HEIGHT,
             )
             beside = discrepancy.scales and alone[1]
             tests, scores = self.scored(discrepancy.columns) if beside else alone

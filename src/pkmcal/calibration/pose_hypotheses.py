@@ -36,11 +36,11 @@ from pkmcal.calibration.localization import frozen_in
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.hand_eye import closed_forms, start_from_poses
 from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.state import State
-from pkmcal.identify.unidentified import identified, only_heights
+from pkmcal.identify.unidentified import identified
 from pkmcal.identify.verdict import VERDICT, RicherModel
 from pkmcal.levels import LARGEST_NOMINAL_ERROR, NEARLY_ALL
 from pkmcal.measurements import Measurements
@@ -519,7 +519,8 @@ def pose_hypotheses(
     """Hypotheses about measured poses: readings, movements and sizes of boards."""
     n_effective = effective_sample_size(machine, measurements)
     # heights do not determine a tracker's pose: score tests detect whether it moved
-    whole = () if only_heights(estimate) else _movements(measurements, estimate)
+    only_heights = estimate.purpose is Purpose.HEIGHT
+    whole = () if only_heights else _movements(measurements, estimate)
     rest = [*whole, *_sizes(machine, measurements, estimate)]
     prior = -log(max(len({one.meaning for one in rest}), 1))
     return reading_mistakes(machine, measurements) + [
@@ -694,7 +695,7 @@ def explain_poses(
     """
     # legs that do not hold the platform leave its pose to the measurement, so that residuals of the
     # poses alone, which are compared here, take up errors of the readings
-    if not estimate.pose_weights.size or session.machine.layout.underdetermined:
+    if not estimate.pose_weights.size or estimate.purpose is Purpose.LENGTHS:
         return Explanation()
     misfit = pose_misfit(estimate)
     richer_misfit = np.inf if richer is None else richer.scale

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from functools import cached_property
 from typing import NamedTuple
 
@@ -18,6 +19,19 @@ from pkmcal.identify.unknowns import Unknowns, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import Machine
+
+
+class Purpose(Enum):
+    """What the result of a calibration promises, by which it is judged.
+
+    Heights alone determine only the tool's height above a bed. Legs that do not hold the platform
+    (four cables under a spatial one) determine no pose by their readings; a controller commands
+    their lengths.
+    """
+
+    POSE = "the tool's pose at given readings"
+    HEIGHT = "the tool's height above the bed"
+    LENGTHS = "the legs' lengths at given poses"
 
 
 class GroupStatistics(NamedTuple):
@@ -184,6 +198,16 @@ class Estimate:
     line_shift_sigma: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = short_repr
+
+    @cached_property
+    def purpose(self) -> Purpose:
+        """What the result promises."""
+        if self.machine.layout.underdetermined:
+            return Purpose.LENGTHS
+        # components that are not measured have zero residuals
+        poses, others = self.pose_residuals, self.edge_weights.size + self.link_weights.size
+        only_heights = not others and len(poses) and not poses[:, :5].any()
+        return Purpose.HEIGHT if only_heights else Purpose.POSE
 
     @cached_property
     def linearized(self) -> Linearization:

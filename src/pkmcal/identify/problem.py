@@ -671,7 +671,7 @@ class Problem:
         length = rod_lengths(layout, self.nominal, self.data.joints)
         bent = displacement**2 > 2 * np.nanmin(length, axis=-1) * self.joint_noise[:, None]
         if bent.any():
-            bent &= singularity_of(layout, scaled_rows(self.closure(state))) > NEAR_SINGULAR
+            bent &= singularity_of(scaled_rows(self.closure(state))) > NEAR_SINGULAR
         return bent
 
 

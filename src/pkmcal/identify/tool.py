@@ -52,15 +52,12 @@ def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
     """Derivatives (n, 6, P) of the pose (omega, tau) by the parameters at given readings.
 
     By the implicit function closure(theta, X) = 0 at given readings: dX = -(dc/dX)^+ dc/dtheta,
-    where X is the pose and, for platforms with hinges, their angles. NaN if the legs do not hold
-    the platform.
+    where X is the pose and, for platforms with hinges, their angles. The legs hold the platform.
 
     joints : (n, m) readings.
     poses : (n, 4, 4) T_base_platform.
     """
     layout = machine.layout
-    if layout.underdetermined:
-        return np.full((len(poses), 6, len(machine.values)), np.nan)
     internal = machine.forward_result(joints, poses).internal if layout.n_internal else None
     c = closure(layout, machine.values, joints, poses, internal)
     by_theta = dense(c, len(machine.values))

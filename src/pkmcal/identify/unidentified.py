@@ -18,7 +18,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.identify.assembly import machine_size
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.motions import (
     UNIDENTIFIED,
@@ -116,7 +116,8 @@ def explain(
     # situation of the session, and effect of the parameters on the platform
     poses = estimate.state.T_base_platform[estimate.configurations]
     imaged = estimate.edge_weights.size > 0
-    around = Situation(machine, visible, poses, imaged, only_heights(estimate), options)
+    heights = estimate.purpose is Purpose.HEIGHT
+    around = Situation(machine, visible, poses, imaged, heights, options)
     effect = platform_by_parameters(machine, poses)
     unseen = {id(d) for d in ranks.unidentified}
 
@@ -152,13 +153,6 @@ def explain(
         others,
         bed,
     )
-
-
-def only_heights(estimate: Estimate) -> bool:
-    """Whether only heights were measured; components that are not measured have zero residuals."""
-    poses = estimate.pose_residuals
-    others = estimate.edge_weights.size + estimate.link_weights.size
-    return not others and len(poses) > 0 and not poses[:, :5].any()
 
 
 def identified(machine: Machine, covariance: Array) -> Booleans:

@@ -12,12 +12,12 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import negligible_shift
 from pkmcal.identify.tool import centres_and_tool, platform_sigma
-from pkmcal.identify.unidentified import Identification, only_heights
+from pkmcal.identify.unidentified import Identification
 from pkmcal.levels import (
     CAUSE_SHARE,
     CONTRADICTION_SIGMAS,
@@ -177,7 +177,7 @@ def _headline(estimate: Estimate, joints: Array | None) -> str:
     machine = estimate.machine
     nominal = machine.with_values(machine.parameters.nominal)
     tool = centres_and_tool(nominal, estimate, joints)[1]
-    if machine.layout.underdetermined:
+    if estimate.purpose is Purpose.LENGTHS:
         before = tool.shift(nominal.values - machine.values)
         return f"Legs' lengths at given poses {amount(before, 'm')} → {amount(tool.sigma, 'm')}."
     changes: list[str] = []
@@ -361,10 +361,10 @@ def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
     """Refusal if most poses are near-singular: small errors then move the platform far, and
     linearization does not hold. A note on legs that hold the platform in no pose.
     """
-    machine = estimate.machine
-    if machine.layout.underdetermined:
+    if estimate.purpose is Purpose.LENGTHS:
         yield note("machine.not_held")
         return
+    machine = estimate.machine
     poses = estimate.state.T_base_platform[estimate.configurations]
     weak = on_manifold(machine.layout, machine.values, poses).singularity < NEAR_SINGULAR
     if weak.mean() >= options.singular_share:
@@ -456,7 +456,7 @@ def _warnings(
     if shading.min() > POLISHED_SHADING:
         yield doubtful("edges.polished", value=float(shading.min()))
     used = int(np.sum(estimate.configurations))
-    if used < options.few_configurations and not only_heights(estimate):
+    if used < options.few_configurations and estimate.purpose is not Purpose.HEIGHT:
         yield note("configurations.few", number=used)
 
 

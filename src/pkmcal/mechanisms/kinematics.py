@@ -277,7 +277,7 @@ class ForwardResult:
         """
         poses, phi = self.T_base_platform, self.internal
         c = closure(self.layout, self.theta, self.readings, poses, phi)
-        return singularity_of(self.layout, scaled_rows(c))
+        return singularity_of(scaled_rows(c))
 
 
 def readings_at_poses(
@@ -462,14 +462,14 @@ def scaled_rows(c: Closure) -> Array:
     return by_own(c.layout, c.rows) * own_scale(c.layout, c.theta)[..., None, :]
 
 
-def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
+def singularity_of(scaled: Array) -> Array:
     """Smallest singular value (...) of :func:`scaled_rows`, whose rows are about unit vectors: 0 if
     the platform can move with all joints locked; NaN if the rows are not finite.
     """
-    if layout.underdetermined:
-        return np.zeros(scaled.shape[:-2])
     finite = np.isfinite(scaled).all(axis=(-1, -2))
-    least = np.linalg.svd(np.nan_to_num(scaled), compute_uv=False)[..., -1]
+    singular_values = np.linalg.svd(np.nan_to_num(scaled), compute_uv=False)
+    # one a freedom; with fewer rows than freedoms the last is missing, and 0
+    least = singular_values[..., scaled.shape[-1] - 1 :].sum(axis=-1)
     return np.where(finite, least, np.nan)
 
 

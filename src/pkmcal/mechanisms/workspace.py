@@ -62,7 +62,7 @@ class Limits:
         refused everywhere.
         """
         scaled = scaled_rows(closure_at(self.layout, self.theta, self.home))
-        least = 0.5 * float(singularity_of(self.layout, scaled))
+        least = 0.5 * float(singularity_of(scaled))
         return float(sign_of(scaled)), min(NEAR_SINGULAR, least)
 
 
@@ -151,7 +151,7 @@ def reachable(limits: Limits, poses: Array) -> Reach:
         c = closure_at(limits.layout, limits.theta, poses)
         residual = undriven(c)[0]
     readings, scaled = c.readings, scaled_rows(c)
-    singularity = singularity_of(limits.layout, scaled)
+    singularity = singularity_of(scaled)
     lost = np.isnan(readings)
     off = np.where(lost.any(axis=-1), 0.0, np.abs(residual).max(axis=-1, initial=0.0))
     sign, least = limits.at_home

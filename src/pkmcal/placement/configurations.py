@@ -90,9 +90,7 @@ def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     rows, home_rows = scaled_rows(c), scaled_rows(at_home)
     good = np.abs(c.rows.value).max(axis=-1) < 1e-9
     # a machine that is close to singular at home is so everywhere, and is not refused for that
-    good &= singularity_of(layout, rows) > min(
-        LEAST_SINGULAR, 0.4 * float(singularity_of(layout, home_rows))
-    )
+    good &= singularity_of(rows) > min(LEAST_SINGULAR, 0.4 * float(singularity_of(home_rows)))
     good &= sign_of(rows) == sign_of(home_rows)
     good &= T_base_platform[..., 2, 2] * np.sign(home[2, 2]) > np.cos(FARTHEST_TILT)
     good &= platform_unfolded(machine, T_base_platform)
