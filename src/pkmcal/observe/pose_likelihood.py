@@ -196,11 +196,11 @@ def distinct_silhouettes(view: StationView, candidates: Array, images: Integers)
         return list(range(len(candidates)))
     legs = view.legs(images).under(candidates)
     pixel = edge_points(view.machine, view.camera, legs, view.tubes, 2).pixel
-    retained: list[int] = []
-    for h in range(len(candidates)):
+    retained = [0]
+    for h in range(1, len(candidates)):
         away = pixel[retained] - pixel[h]
         off = np.nan_to_num(np.hypot(away[..., 0], away[..., 1])) / view.tables.scale
-        if all(np.median(other) > view.options.apart for other in off):
+        if np.all(np.median(off.reshape(len(off), -1), axis=1) > view.options.apart):
             retained.append(h)
     return retained
 

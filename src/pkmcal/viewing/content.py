@@ -75,7 +75,9 @@ class SessionContent:
         self.corners = lru_cache(DECODED_IMAGES_CACHED)(self._corners)
         self.start = cache(self._start)
         self.thumbnail = cache(self._thumbnail)
+        # by station, of Fit: the data of its search, and the poses (H, 4, 4) found everywhere
         self.views: dict[int, StationView] = {}
+        self.poses_anywhere: dict[int, Array] = {}
 
     def station(self, s: int) -> Station:
         """Station by its index. Raises InputError for an index out of range."""

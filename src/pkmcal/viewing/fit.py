@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
 from pkmcal.levels import OUTLIER_SIGMAS
@@ -96,8 +96,7 @@ def localized_overlay(content: SessionContent, request: ViewRequest) -> Localiza
     if len(view.configuration) >= FEWEST_FITTED_TOGETHER:
         judgement = _from_images(view, None if request.anywhere else start, joints)
     else:
-        image = content.image(request.station, request.image)
-        judgement = _from_one_image(view, image, near, joints)
+        judgement = _from_one_image(view, near, joints)
     pose = judgement.T_camera_base if judgement.localized else start
     # overlay at the localized pose, without the gesture and pins that led to the start
     plain = {"pose": pose_rows(pose), "gesture": None, "pins": ()}
@@ -133,18 +132,18 @@ def _from_images(view: StationView, start: Array | None, joints: _PlacedJoints) 
     return _Judgement(pose.T_camera_base, pose.good and not moved, text)
 
 
-def _from_one_image(
-    view: StationView,
-    image: Integers,
-    start: Array | None,
-    joints: _PlacedJoints,
-) -> _Judgement:
-    """Localization from one image, everywhere and near a start.
+def _from_one_image(view: StationView, start: Array | None, joints: _PlacedJoints) -> _Judgement:
+    """Localization from the only image of a station, everywhere and near a start.
 
     The start is no evidence: a person may take one leg of a machine of equal parts for another. The
     joints that a person placed are.
     """
-    poses = localize_image(view, image).T_camera_base
+    content, s = joints.content, joints.request.station
+    image = content.image(s, joints.request.image)
+    # the search everywhere takes most of the time, and the user fits repeatedly
+    if s not in content.poses_anywhere:
+        content.poses_anywhere[s] = localize_image(view, image).T_camera_base
+    poses = content.poses_anywhere[s]
     if start is not None:
         poses = np.concatenate([localize_near(view, image, start).T_camera_base, poses])
     hypotheses = with_neighbours(view, image, poses)
