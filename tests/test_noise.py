@@ -99,6 +99,21 @@ def test_intervals_hold_the_truth_as_often_as_they_state(configurations, true):
     assert coverage(configurations, true, NOISE.contradiction_chance, 400)[0] > 0.985
 
 
+def test_intervals_of_tracked_poses_hold_the_truth_as_often(tmp_path):
+    """Those of readings and of poses, of hexapods that a tracker measured."""
+    right = []
+    for seed in range(12):
+        made = make(tmp_path / str(seed), "gough-stewart", n=16, seed=seed)
+        estimate = calibrate_session(made.folder).estimate
+        start = batch_of(estimate.machine, estimate.problem, estimate.state)
+        result = solve_batch(estimate.problem.problem, start, scale_noise=False)
+        for kind in (READING_ROWS, POSE_ROWS):
+            low, high = result.noise_of(kind).interval(0.05)
+            right.append(low[0] <= 1 <= high[0])
+    # of 24 right ones of 95 %, four are wrong once in forty cases
+    assert np.sum(right) > 20
+
+
 def test_noise_of_edges_that_poses_take_up_is_not_that_of_readings():
     """Correlated edges, so that poses absorb half or twice of the error of independent ones.
 

@@ -480,15 +480,23 @@ def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
     """Factor (B,) on the stated noise of poses or links that makes their chi2 equal its degrees of
     freedom.
 
-    scale : (B,) factor in use, unchanged where too few degrees of freedom remain.
+    scale : (B,) factor in use, unchanged where too few residuals determine it: their effective
+        number is tr M^2 with the noise's share M in their covariance
+        (:mod:`pkmcal.identify.noise`). Four cables' readings scatter more than a tracker, whose
+        poses have small shares in many residuals.
     """
     kinds = fit.info.problem.row_groups
     if not (kinds.poses if kind == POSE_ROWS else kinds.links).present.any():
         return scale
+    poses, links = counts(fit.info.problem, fit.weight)[1:]
     components = fit.components
     chi2, freedom = components.chi2[:, kind], components.freedom[:, kind]
+    # (tr M)^2 / n is a lower bound, which nearly always suffices
+    number = freedom**2 / np.maximum(poses if kind == POSE_ROWS else links, 1.0)
+    if number.min() <= LEAST_NOISE_FREEDOM:
+        number = np.sum(fit.noise_of(kind).own ** 2, axis=-1)
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
-    return np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
+    return np.where(number > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
 
 
 def _shading_of(fit: BatchResult, least: Array, options: LineShadingOptions) -> Array:

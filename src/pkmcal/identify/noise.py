@@ -19,8 +19,9 @@ t is unknown, a nuisance parameter. Errors of the edges of a line are correlated
 residual shows how much of their common error a pose absorbs; so where readings are far sharper than
 poses are measured, a change of t by one hundredth would change the sum of all z^2 by as much as all
 of the readings' noise does. Directions in which poses are determined well and badly separate s from
-t. The interval of s is that of the profile likelihood, with the best t for every s; it is wide
-where the directions contain little information.
+t. The interval of s is that of the profile likelihood, with the best t for every s, up to a factor
+at which the others' noise would be refused; it is wide where the directions contain little
+information.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.row_sums import GroupRows, group_rows
-from pkmcal.levels import NEGLIGIBLE
+from pkmcal.levels import NEGLIGIBLE, UNEXPLAINED_SCALE
 from pkmcal.measurements.rows import RowGroups
+from pkmcal.solver.ranks import RANK_TOLERANCE, inverse_root
 
 LEAST_NOISE_FREEDOM = 5.0
 """Degrees of freedom n below which a sum of squares determines no noise: the relative standard
@@ -61,9 +63,11 @@ class NoiseOptions:
     # grid of log s^2: its end to either side (the lower one stands for zero), and number of values
     largest_log_variance: float = 20.0
     variances: int = 41
+    # largest t and 1 / t: a noise that is farther from the one in use is not tenable, so that it
+    # explains no residuals of another kind
+    largest_others: float = UNEXPLAINED_SCALE
     # grid of log t^2 for each s^2, and the steps that refine its best value
-    largest_log_others: float = 14.0
-    others: int = 15
+    log_others: tuple[float, ...] = (-2.0, 0.0, 2.0)
     others_steps: tuple[float, ...] = (1.0, 0.25, 0.0625)
     # bisections of an interval of log s^2
     halvings: int = 8
@@ -297,28 +301,32 @@ class NoiseShares:
             variance = np.maximum(own + np.exp(log)[..., None] * others, least_variance)
             return np.sum(np.log(variance) + squares / variance, axis=-1)
 
-        end = options.largest_log_others
-        tried = np.linspace(-end, end, options.others)
+        end = 2 * np.log(options.largest_others)
+        tried = np.array(options.log_others)
         values = np.stack([value(np.full(square.shape, log)) for log in tried])
         best, log = values.min(axis=0), tried[values.argmin(axis=0)]
         for step in options.others_steps:
             middle, centre = best, log
-            a, b = value(centre - step), value(centre + step)
+            before, after = np.maximum(centre - step, -end), np.minimum(centre + step, end)
+            a, b = value(before), value(after)
             # vertex of the parabola through the three points, at most a step away
             bend = a + b - 2 * middle
             direction = np.where(
                 bend > 0, (a - b) / np.where(bend > 0, bend, 1.0) / 2, np.sign(a - b)
             )
-            there = centre + step * np.clip(direction, -1, 1)
+            there = np.clip(centre + step * np.clip(direction, -1, 1), -end, end)
             here = value(there)
-            for new, place in ((a, centre - step), (b, centre + step), (here, there)):
+            for new, place in ((a, before), (b, after), (here, there)):
                 log, best = np.where(new < best, place, log), np.minimum(new, best)
         return best, log
 
 
 def noise_shares(info: Information, kind: int, options: NoiseOptions = NOISE) -> NoiseShares:
     """Independent residuals of the readings, poses or links at a solution."""
-    rows, half = group_rows(info.problem, info.state, kind), info.root
+    rows = group_rows(info.problem, info.state, kind)
+    # The normal matrix holds half of the digits only: by its root, M would get directions of
+    # rounding, which the unknowns absorb, but which seem to show that the others' noise is small.
+    half = inverse_root(info.rows[0], RANK_TOLERANCE, loose=False)
     in_prior = info.problem.prior @ half
     of_prior = in_prior.mT @ in_prior
     runs = [
