@@ -29,6 +29,7 @@ export interface EveryType {
   Filter: Filter;
   FolderDocument: FolderDocument;
   FolderEntry: FolderEntry;
+  Hint: Hint;
   Image: Image;
   Images: Images;
   JointAxis: JointAxis;
@@ -515,6 +516,13 @@ export interface FolderEntry {
   after: string;
 }
 /**
+ * How to use the page, in small print; not on paper.
+ */
+export interface Hint {
+  kind: "hint";
+  text: string;
+}
+/**
  * Image with its overlays.
  *
  * title, caption : name and contents.
@@ -990,7 +998,7 @@ export interface Section {
   expert: boolean;
   void: boolean;
   blocks: (
-    Paragraph | Listing | Facts | Downloads | DataTable | LogBar | Plot | Panels | Images | Space | ToolMapBlock
+    Paragraph | Hint | Listing | Facts | Downloads | DataTable | LogBar | Plot | Panels | Images | Space | ToolMapBlock
   )[];
 }
 /**

@@ -28,7 +28,7 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks import images as blocks
 from pkmcal.outcome.blocks.base import Key
-from pkmcal.outcome.blocks.text import Paragraph
+from pkmcal.outcome.blocks.text import Hint, Paragraph
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.page_links import Links
 from pkmcal.session.load import Session
@@ -55,7 +55,7 @@ FIELD_READING_TEXT = (
     " mean of each cell of the image. Without order where the camera's file is right; arrows that"
     " grow with the distance from the principal point (cross), or turn round it, are a lens that"
     " the file does not describe. Pale: not significant; of a hundred cells one is strong by"
-    " chance. A click on an arrow leads to the image with the largest residual there."
+    " chance."
 )
 
 
@@ -129,7 +129,11 @@ def section(
     return Part(
         "field",
         "Residuals over the image",
-        blocks=(Paragraph(text=text), block),
+        blocks=(
+            Paragraph(text=text),
+            Hint(text="A click on an arrow leads to the image with the largest residual there."),
+            block,
+        ),
         menu="Over the image",
     )
 

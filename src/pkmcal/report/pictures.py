@@ -35,7 +35,7 @@ from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tu
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks import images as blocks
 from pkmcal.outcome.blocks.base import image_key
-from pkmcal.outcome.blocks.text import Paragraph
+from pkmcal.outcome.blocks.text import Hint, Paragraph
 from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.page_links import Place
 from pkmcal.report.residuals import outward_shift
@@ -94,6 +94,7 @@ def section(session: Session, album: Album) -> Part:
     parts = [
         Paragraph(text=_order_text(album)),
         Paragraph(text=_legend_text(album), small=True),
+        *_strips_hint(album),
         blocks.Images(images=album.images, legs=legs if _has(album, "edges") else 0),
     ]
     if album.rejected:
@@ -110,17 +111,21 @@ def section(session: Session, album: Album) -> Part:
 
 def _order_text(album: Album) -> str:
     """Which images there are, and their order."""
-    n, strips = len(album.images), sum(bool(one.strips) for one in album.images)
+    n = len(album.images)
     some = f"{n} of {album.total} images" if n < album.total else f"All {count(n, 'image')}"
     text = f"{some}: those without data in use first, then by their residuals, the largest first"
-    text += "; last those that were held out." if album.held_out else "."
-    if strips:
-        which = "every image" if strips == n else f"{count(strips, 'image')}"
-        text += (
-            f" In {which}, a click on an edge shows the image along it, with the fitted line and"
-            " its standard deviation."
-        )
-    return text
+    return text + ("; last those that were held out." if album.held_out else ".")
+
+
+def _strips_hint(album: Album) -> tuple[Hint, ...]:
+    """How to see the strips along the edges, of an album with some."""
+    n, strips = len(album.images), sum(bool(one.strips) for one in album.images)
+    which = "every image" if strips == n else count(strips, "image")
+    text = (
+        f"In {which}, a click on an edge shows the image along it, with the fitted line and its"
+        " standard deviation."
+    )
+    return (Hint(text=text),) if strips else ()
 
 
 def _legend_text(album: Album) -> str:
@@ -419,7 +424,7 @@ class _ImageOverlays:
     def _use(self, configuration: int, level: float) -> str:
         """What is used of an image. level : of its residuals, NaN without any."""
         if np.isfinite(level):
-            return f"residuals {number(level, 2)} σ"
+            return f"residuals {number(level, 2)}\N{NO-BREAK SPACE}σ"
         out = self.calibration.holdout
         return "held out" if out and configuration in out.region.rows else "nothing in use"
 
