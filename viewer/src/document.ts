@@ -104,10 +104,10 @@ export interface Arrow {
    * @maxItems 2
    */
   displacement: [number, number];
-  key: string;
-  tip: string;
-  dashed: boolean;
-  label: string;
+  key?: string;
+  tip?: string;
+  dashed?: boolean;
+  label?: string;
 }
 /**
  * Shaded range of an axis, over the whole of the other one.
@@ -364,8 +364,8 @@ export interface Cross {
    * @maxItems 2
    */
   at: [number, number];
-  key: string;
-  tip: string;
+  key?: string;
+  tip?: string;
 }
 /**
  * Table; folded : collapsed until it is opened.
@@ -573,15 +573,15 @@ export interface Layer {
  * key : what it belongs to; a leg's key gives the colour.
  * tip : tooltip.
  * dashed : measured, but not in use.
- * strip : index of its strip in the image's ``strips``, null without one.
+ * strip : index of its strip in the image's ``strips``, absent without one.
  */
 export interface Polyline {
   shape: "polyline";
   points: [number, number][];
-  key: string;
-  tip: string;
-  dashed: boolean;
-  strip: number | null;
+  key?: string;
+  tip?: string;
+  dashed?: boolean;
+  strip?: number | null;
 }
 /**
  * Circle of a fixed size around a pixel.
@@ -596,11 +596,11 @@ export interface Ring {
    * @maxItems 2
    */
   at: [number, number];
-  key: string;
-  tip: string;
-  dashed: boolean;
-  label: string;
-  filled: boolean;
+  key?: string;
+  tip?: string;
+  dashed?: boolean;
+  label?: string;
+  filled?: boolean;
 }
 /**
  * Image along an edge, sampled in native pixels across the predicted edge and along it.

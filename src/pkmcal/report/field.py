@@ -200,9 +200,10 @@ def field_offsets(
 
     The camera's estimated edge shift is subtracted.
     """
+    inlier = estimate.edge_weights >= INLIER_WEIGHT
     parts = [
-        _of_edges(session, edges, estimate, s)
-        for s in np.unique(edges.station[estimate.edge_weights >= INLIER_WEIGHT]).tolist()
+        edge_offsets(session, edges, estimate, s, np.flatnonzero(inlier & (edges.station == s)))
+        for s in np.unique(edges.station[inlier]).tolist()
     ]
     used, n = np.flatnonzero(corners.used), len(edges)
     parts += [
@@ -223,10 +224,15 @@ def field_offsets(
     return offsets.select(np.asarray(finite))
 
 
-def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> Offsets:
-    """Offsets of one station's edges."""
+def edge_offsets(
+    session: Session, edges: EdgeSet, estimate: Estimate, s: int, mine: Integers
+) -> Offsets:
+    """Offsets of one station's edges, each at all of ``FIELD_EDGE_FRACTIONS`` in turn; NaN outside
+    the image.
+
+    mine : (n,) indices of the edges.
+    """
     state, machine, camera = estimate.state, estimate.machine, session.stations[s].camera
-    mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= INLIER_WEIGHT))
     some = edges.select(mine)
     rows, image = np.unique(some.configuration, return_inverse=True)
     # predicted edges with the estimated edge shift, from which measured ones are offset
