@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+import pkmcal
 from conftest import FEW_IMPUTATIONS, run
 from pkmcal.api.check import CheckResult
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
@@ -476,6 +477,13 @@ def test_a_study_of_repeats_without_repeats_states_what_to_write(demo):
         study_repeats(demo.session)
     assert "images/station1/{configuration}_{repeat}.png" in str(caught.value)
     assert "images/station1/0001_1.png" in str(caught.value)
+
+
+def test_check_repeat_without_repeats_is_refused_before_the_work(demo):
+    shares = []
+    with pytest.raises(InputError, match="the session has no repeated images"):
+        pkmcal.check(demo.session, repeat=True, progress=lambda _text, share: shares.append(share))
+    assert max(shares) < 0.05
 
 
 def test_repeats_are_asked_of_cameras_that_stand(demo):

@@ -271,7 +271,7 @@ def test_pictures_are_sorted_by_their_residuals_those_of_no_use_first(case):
     assert named[:2] == [("front0", "c2"), ("front1", "c3")]
     assert named[-1] == ("front2", "c4")
     assert "nothing in use" in display[0].caption
-    assert "residuals 5.00 σ" in display[1].caption
+    assert "residuals 5.00\N{NO-BREAK SPACE}σ" in display[1].caption
 
 
 def test_edges_that_were_left_out_are_drawn_with_their_reason(case):

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from pkmcal.observe.images import Pictures, upright_turns
 from pkmcal.outcome import Verdict
 from pkmcal.report import pictures
 from pkmcal.report.calibration import report_of
+from pkmcal.report.residuals import outward_shift
 from pkmcal.report.strips import STRIP_ROWS, edge_lines, sampled_strip, strips_of_image
 from pkmcal.web.report_page import report_page
 from test_report_case import OUTWARD, Case, calibration, make_case
@@ -184,13 +186,13 @@ def test_the_page_holds_each_image_once_with_its_strips(page, case):
         (overlay,) = image["overlays"]
         layers = {layer["name"]: layer["shapes"] for layer in overlay["layers"]}
         assert len(layers["joints"]) == len(layers["nominal"]) == 12
-        with_strip = [line["strip"] for line in layers["edges"] if line["strip"] is not None]
+        with_strip = [line["strip"] for line in layers["edges"] if "strip" in line]
         assert with_strip == list(range(len(image["strips"])))
         for line in layers["edges"]:
-            if line["strip"] is not None:
+            if "strip" in line:
                 name = line["tip"].partition(":")[0]
                 assert image["strips"][line["strip"]]["title"].startswith(f"{name}: ")
-    assert any(line["dashed"] for one in images for line in edges_of_image(one))
+    assert any(line.get("dashed") for one in images for line in edges_of_image(one))
     # keys are those of the selection
     assert images[0]["key"] == "image:" + images[0]["title"].replace(" / ", "/")
 
@@ -209,7 +211,7 @@ def test_arrows_of_the_field_lead_to_images(page):
         shape
         for image in field["images"]
         for shape in image["overlays"][0]["layers"][0]["shapes"]
-        if shape["shape"] == "arrow" and not shape["label"]
+        if shape["shape"] == "arrow" and "label" not in shape
     ]
     assert arrows
     assert {arrow["key"] for arrow in arrows} <= keys
@@ -231,7 +233,39 @@ def test_corners_and_joints_are_apart_in_layers(case):
     names = {
         layer.name for image in album.images for layer in image.overlays[0].layers if layer.shapes
     }
-    assert names == {"edges", "rejected", "joints", "nominal"}
+    assert names == {"edges", "residuals", "rejected", "joints", "nominal"}
+
+
+def test_residual_arrows_lead_from_their_edges_to_those_of_the_machine(case):
+    """Their tails are on the measured lines, and their lengths are the stated shifts."""
+    estimate, observation = case.estimate, case.observation
+    value = calibration(case.session, observation, estimate)
+    centres = joint_centres(case.session.machine, estimate.machine, estimate.covariance)
+    shifts = outward_shift(
+        observation.edges, estimate, case.session.joints, case.session.camera_of_station
+    )
+    pairs = []
+    for image in pictures.album(value, shifts, centres).images:
+        layers = {layer.name: layer.shapes for layer in image.overlays[0].layers}
+        lines = layers["edges"]
+        n, ends = zip(
+            *((n, two) for n, one in enumerate(lines) for two in pairwise(one.points)), strict=True
+        )
+        start, along = np.array(ends)[:, 0], np.diff(ends, axis=1)[:, 0]
+        normal = np.stack([-along[:, 1], along[:, 0]], 1) / np.linalg.norm(along, axis=1)[:, None]
+        for arrow in layers.get("residuals", ()):
+            off, displacement = np.array(arrow.at) - start, np.array(arrow.displacement)
+            share = np.sum(off * along, axis=1) / np.sum(along**2, axis=1)
+            distance = np.abs(np.sum(off * normal, axis=1))
+            k = int(np.where(np.abs(share - 0.5) < 0.5, distance, np.inf).argmin())
+            assert distance[k] < 0.17  # lines are straight to 0.1 px, and tails are rounded
+            stated = lines[n[k]].tip.split(": ")[1].split(" px")[0].replace("\N{MINUS SIGN}", "-")
+            across = displacement @ normal[k]
+            assert abs(np.hypot(*displacement) - abs(across)) < 2e-3
+            pairs.append((abs(across), abs(float(stated))))
+    assert len(pairs) > 100
+    drawn, stated = np.array(pairs).T
+    np.testing.assert_allclose(drawn, stated, atol=0.02)
 
 
 INSPECTED = """

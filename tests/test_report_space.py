@@ -118,10 +118,11 @@ def test_points_have_the_keys_of_their_configurations(case):
     np.testing.assert_allclose(points.points, places, atol=ROUNDED)
 
 
-def test_many_poses_are_thinned_and_the_caption_has_their_number(case):
-    block = stage(case, most=3)
+def test_many_poses_are_thinned_and_the_hint_has_their_number(case):
+    part = scene.section(case.session, case.estimate, centres_of(case), NO_TARGETS, None, most=3)
+    block, hint = part.blocks
     assert [pose.label for pose in block.poses] == ["c0", "c2", "c4"]
-    assert "3 poses of 5" in block.caption
+    assert "3 poses of 5" in hint.text
     assert len(block.points[0].points) == 5
 
 

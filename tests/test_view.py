@@ -917,6 +917,7 @@ def test_a_session_is_worked_on_in_a_browser(session, demo, truth, tmp_path, wid
     assert (root["faults"], root["overhang"]) == ("", "0")
     station, images = loaded.stations[0], sum(len(one.images) for one in loaded.stations)
     names = [loaded.configurations[one.configuration] for one in station.images]
+    assert root["first"] == "Calibrated"
     assert root["next"] == f"{station.name} / {names[1]}"
     assert root["back"] == f"{station.name} / {names[0]}"
     # the image has all its pixels; every image is in the list, with its mark

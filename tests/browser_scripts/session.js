@@ -28,6 +28,9 @@ const under = (place) => {
 const marks = () => all(".session-images li .sign").map((one) => one.className.replace("sign ", ""));
 addEventListener("load", async () => {
   await settled();
+  out.first = $("[aria-label='Machine laid over'] [aria-pressed=true]").textContent;
+  press("Nominal");
+  await settled();
   const title = () => $(".session-image h2").textContent;
   out.size = await new Promise((done) => {
     const full = new Image();

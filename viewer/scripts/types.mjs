@@ -5,9 +5,11 @@ import { compile } from "json-schema-to-typescript";
 const schema = JSON.parse(
   await readFile(new URL("../../src/pkmcal/web/schema.json", import.meta.url), "utf8"),
 );
-// Python writes every field, also those with a default
+// Python writes every field, also those with a default, except where a field says otherwise
 for (const part of [schema, ...Object.values(schema.$defs)]) {
-  if (part.properties) part.required = Object.keys(part.properties);
+  if (!part.properties) continue;
+  part.required = Object.keys(part.properties).filter((name) => !part.properties[name].omittedAtDefault);
+  for (const one of Object.values(part.properties)) delete one.omittedAtDefault;
 }
 // a title on each field would become a type of its own; tuples are written as before 2020-12
 const strip = (node) => {

@@ -29,6 +29,7 @@ export interface EveryType {
   Filter: Filter;
   FolderDocument: FolderDocument;
   FolderEntry: FolderEntry;
+  Hint: Hint;
   Image: Image;
   Images: Images;
   JointAxis: JointAxis;
@@ -103,10 +104,10 @@ export interface Arrow {
    * @maxItems 2
    */
   displacement: [number, number];
-  key: string;
-  tip: string;
-  dashed: boolean;
-  label: string;
+  key?: string;
+  tip?: string;
+  dashed?: boolean;
+  label?: string;
 }
 /**
  * Shaded range of an axis, over the whole of the other one.
@@ -363,8 +364,8 @@ export interface Cross {
    * @maxItems 2
    */
   at: [number, number];
-  key: string;
-  tip: string;
+  key?: string;
+  tip?: string;
 }
 /**
  * Table; folded : collapsed until it is opened.
@@ -515,6 +516,13 @@ export interface FolderEntry {
   after: string;
 }
 /**
+ * How to use the page, in small print; not on paper.
+ */
+export interface Hint {
+  kind: "hint";
+  text: string;
+}
+/**
  * Image with its overlays.
  *
  * title, caption : name and contents.
@@ -565,15 +573,15 @@ export interface Layer {
  * key : what it belongs to; a leg's key gives the colour.
  * tip : tooltip.
  * dashed : measured, but not in use.
- * strip : index of its strip in the image's ``strips``, null without one.
+ * strip : index of its strip in the image's ``strips``, absent without one.
  */
 export interface Polyline {
   shape: "polyline";
   points: [number, number][];
-  key: string;
-  tip: string;
-  dashed: boolean;
-  strip: number | null;
+  key?: string;
+  tip?: string;
+  dashed?: boolean;
+  strip?: number | null;
 }
 /**
  * Circle of a fixed size around a pixel.
@@ -588,11 +596,11 @@ export interface Ring {
    * @maxItems 2
    */
   at: [number, number];
-  key: string;
-  tip: string;
-  dashed: boolean;
-  label: string;
-  filled: boolean;
+  key?: string;
+  tip?: string;
+  dashed?: boolean;
+  label?: string;
+  filled?: boolean;
 }
 /**
  * Image along an edge, sampled in native pixels across the predicted edge and along it.
@@ -990,7 +998,7 @@ export interface Section {
   expert: boolean;
   void: boolean;
   blocks: (
-    Paragraph | Listing | Facts | Downloads | DataTable | LogBar | Plot | Panels | Images | Space | ToolMapBlock
+    Paragraph | Hint | Listing | Facts | Downloads | DataTable | LogBar | Plot | Panels | Images | Space | ToolMapBlock
   )[];
 }
 /**

@@ -73,7 +73,7 @@ function pathData(shape: Shape): string {
 }
 
 function shapeGroup(shape: Shape, layer: Layer, image: Image): SVGElement {
-  const group = svg("g", { class: ["shape", keyClass(shape.key), dashed(shape) ? "dashed" : ""].filter(Boolean).join(" ") });
+  const group = svg("g", { class: ["shape", keyClass(shape.key ?? ""), dashed(shape) ? "dashed" : ""].filter(Boolean).join(" ") });
   if (shape.key) group.dataset.key = shape.key;
   if (shape.tip) group.dataset.tip = shape.tip;
   const mark = (at: [number, number], turn: number, ...children: Node[]): SVGElement =>
@@ -82,7 +82,7 @@ function shapeGroup(shape: Shape, layer: Layer, image: Image): SVGElement {
   switch (shape.shape) {
     case "polyline": {
       const d = pathData(shape);
-      if (shape.strip !== null) group.dataset.strip = String(shape.strip);
+      if (shape.strip != null) group.dataset.strip = String(shape.strip);
       group.append(svg("path", { class: "hit", d }), svg("path", { class: "line", d }));
       break;
     }
@@ -119,4 +119,4 @@ function shapeGroup(shape: Shape, layer: Layer, image: Image): SVGElement {
   return group;
 }
 
-const dashed = (shape: Shape): boolean => "dashed" in shape && shape.dashed;
+const dashed = (shape: Shape): boolean => "dashed" in shape && shape.dashed === true;

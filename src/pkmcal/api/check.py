@@ -89,11 +89,16 @@ def check(
         ``findings``, ``stations``, ``joints``, ``forecast``, ``advice``, ``exit_code`` (0 good, 1
         less accurate than it could be, 2 cannot be calibrated), ``summary()``, ``save(folder)``.
 
+    Raises
+    ------
+    pkmcal.errors.InputError
+        With ``repeat``, the session has no repeated images.
+
     """
     study = None
     with whole(progress, "Reading the session") as report:
         own = part(report, 0, 0.4 if repeat else 1)
-        value = check_session(session, seed=seed, progress=own)
+        value = check_session(session, seed=seed, repeat=repeat, progress=own)
         if repeat and value.exit_code < 2:
             study = study_repeats(session, seed=seed, progress=part(report, 0.4, 1))
     return CheckResult.of(value, repeat=repeat, repeats=study)

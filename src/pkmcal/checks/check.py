@@ -46,6 +46,7 @@ from pkmcal.checks.sentences import (
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.verdict import misfit
+from pkmcal.judge.repeatability import require_repeats
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
@@ -66,18 +67,19 @@ BROKEN_IMAGES_NAMED = 10
 
 
 def check_session(
-    folder: Path | str, *, seed: int = 0, progress: Progress = no_progress
+    folder: Path | str, *, seed: int = 0, repeat: bool = False, progress: Progress = no_progress
 ) -> SessionCheck:
     """Check a session; faults are returned as findings, never raised.
 
     seed : of the random searches, as in `calibrate`.
+    repeat : raise InputError, before the images are read, for a session without repeated images.
     """
     # as in `calibrate`: threads inside the linear algebra would hinder each other
     with threadpool_limits(1, "blas"):
-        return _check(Path(folder), seed, progress)
+        return _check(Path(folder), seed, repeat, progress)
 
 
-def _check(folder: Path, seed: int, progress: Progress) -> SessionCheck:
+def _check(folder: Path, seed: int, repeat: bool, progress: Progress) -> SessionCheck:
     """Steps of :func:`check_session`."""
     progress("Reading the session", 0.0)
     findings = [*untouched_files(folder)]
@@ -85,6 +87,8 @@ def _check(folder: Path, seed: int, progress: Progress) -> SessionCheck:
         session = load_session(folder)
     except PkmcalError as error:
         return SessionCheck(str(folder), (of_error(error), *findings))
+    if repeat:
+        require_repeats(session)
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
     progress("Reading images" if session.stations else "Reading the measurements", 0.05)
     images, broken = _decode_images(session)

@@ -28,7 +28,7 @@ from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import image_key
 from pkmcal.outcome.blocks.images import Image, Images, Overlay
 from pkmcal.outcome.blocks.plot import leg_colour
-from pkmcal.outcome.blocks.text import Paragraph
+from pkmcal.outcome.blocks.text import Hint, Paragraph
 
 DRAWN_PIXEL_BINARY_DIGITS = 4
 """Binary digits of the fractions of a pixel in cv2's drawing functions."""
@@ -45,7 +45,7 @@ NOMINAL_OVER_IMAGES_TEXT = (
     "Lines: the nominal model's legs in their colours; circles: its joints. By the pose found they"
     " lie on the legs to a few pixels, as far as the nominal model is right; where they do not, or"
     " follow another leg, something is mixed up. By a pose by hand they need only lie near the"
-    " legs. Open an image to compare both poses (key o)."
+    " legs."
 )
 
 
@@ -67,7 +67,11 @@ def with_pictures(inspection: Inspection) -> Part:
     return Part(
         "photographs",
         "The nominal model over the images",
-        blocks=(Paragraph(text=text), block),
+        blocks=(
+            Paragraph(text=text),
+            Hint(text="Open an image to compare both poses (key o)."),
+            block,
+        ),
         menu="Images",
     )
 

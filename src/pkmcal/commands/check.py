@@ -14,7 +14,7 @@ OVERLAYS_DESCRIPTION = "the nominal model over each image"
 EXAMPLES = """\
 pkmcal check my-machine
 pkmcal check my-machine -o check
-pkmcal check my-machine --pictures drawn --repeat
+pkmcal check my-machine --pictures drawn --seed 1
 """
 
 

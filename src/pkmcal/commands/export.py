@@ -13,7 +13,7 @@ from pkmcal.commands.options import argument, as_json, cameras_session, command,
 EXAMPLES = """\
 pkmcal export out --to c
 pkmcal export out --to mujoco -o model
-pkmcal export h4 --to ros --json
+pkmcal export h4 --to urdf --json
 """
 
 

@@ -487,8 +487,8 @@ def _data(
     return Figure(
         DATA_QUESTION,
         ((f"{used} of {taken}", "images"),),
-        f"{'; '.join(parts)}; {count(len(observation.rejected), 'measurement')} rejected"
-        f"{remainder}",
+        f"{'; '.join(parts)}; {count(len(observation.rejected), 'measurement')} rejected or"
+        f" not detected{remainder}",
     )
 
 

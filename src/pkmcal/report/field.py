@@ -28,7 +28,7 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks import images as blocks
 from pkmcal.outcome.blocks.base import Key
-from pkmcal.outcome.blocks.text import Paragraph
+from pkmcal.outcome.blocks.text import Hint, Paragraph
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.page_links import Links
 from pkmcal.session.load import Session
@@ -55,7 +55,7 @@ FIELD_READING_TEXT = (
     " mean of each cell of the image. Without order where the camera's file is right; arrows that"
     " grow with the distance from the principal point (cross), or turn round it, are a lens that"
     " the file does not describe. Pale: not significant; of a hundred cells one is strong by"
-    " chance. A click on an arrow leads to the image with the largest residual there."
+    " chance."
 )
 
 
@@ -129,7 +129,11 @@ def section(
     return Part(
         "field",
         "Residuals over the image",
-        blocks=(Paragraph(text=text), block),
+        blocks=(
+            Paragraph(text=text),
+            Hint(text="A click on an arrow leads to the image with the largest residual there."),
+            block,
+        ),
         menu="Over the image",
     )
 
@@ -196,9 +200,10 @@ def field_offsets(
 
     The camera's estimated edge shift is subtracted.
     """
+    inlier = estimate.edge_weights >= INLIER_WEIGHT
     parts = [
-        _of_edges(session, edges, estimate, s)
-        for s in np.unique(edges.station[estimate.edge_weights >= INLIER_WEIGHT]).tolist()
+        edge_offsets(session, edges, estimate, s, np.flatnonzero(inlier & (edges.station == s)))
+        for s in np.unique(edges.station[inlier]).tolist()
     ]
     used, n = np.flatnonzero(corners.used), len(edges)
     parts += [
@@ -219,10 +224,15 @@ def field_offsets(
     return offsets.select(np.asarray(finite))
 
 
-def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> Offsets:
-    """Offsets of one station's edges."""
+def edge_offsets(
+    session: Session, edges: EdgeSet, estimate: Estimate, s: int, mine: Integers
+) -> Offsets:
+    """Offsets of one station's edges, each at all of ``FIELD_EDGE_FRACTIONS`` in turn; NaN outside
+    the image.
+
+    mine : (n,) indices of the edges.
+    """
     state, machine, camera = estimate.state, estimate.machine, session.stations[s].camera
-    mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= INLIER_WEIGHT))
     some = edges.select(mine)
     rows, image = np.unique(some.configuration, return_inverse=True)
     # predicted edges with the estimated edge shift, from which measured ones are offset

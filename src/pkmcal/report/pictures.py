@@ -35,8 +35,9 @@ from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tu
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks import images as blocks
 from pkmcal.outcome.blocks.base import image_key
-from pkmcal.outcome.blocks.text import Paragraph
+from pkmcal.outcome.blocks.text import Hint, Paragraph
 from pkmcal.report.corners import BoardCorners, board_corners
+from pkmcal.report.field import FIELD_EDGE_FRACTIONS, edge_offsets
 from pkmcal.report.page_links import Place
 from pkmcal.report.residuals import outward_shift
 from pkmcal.report.strips import edge_lines, strips_of_image
@@ -48,8 +49,8 @@ from pkmcal.wording import brief, count, number
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-CORNER_ARROW_LENGTH = 0.03
-"""Length of a large corner residual as drawn, in image widths."""
+RESIDUAL_ARROW_LENGTH = 0.03
+"""Length of a large residual as drawn, in image widths."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ def section(session: Session, album: Album) -> Part:
     parts = [
         Paragraph(text=_order_text(album)),
         Paragraph(text=_legend_text(album), small=True),
+        *_strips_hint(album),
         blocks.Images(images=album.images, legs=legs if _has(album, "edges") else 0),
     ]
     if album.rejected:
@@ -110,17 +112,21 @@ def section(session: Session, album: Album) -> Part:
 
 def _order_text(album: Album) -> str:
     """Which images there are, and their order."""
-    n, strips = len(album.images), sum(bool(one.strips) for one in album.images)
+    n = len(album.images)
     some = f"{n} of {album.total} images" if n < album.total else f"All {count(n, 'image')}"
     text = f"{some}: those without data in use first, then by their residuals, the largest first"
-    text += "; last those that were held out." if album.held_out else "."
-    if strips:
-        which = "every image" if strips == n else f"{count(strips, 'image')}"
-        text += (
-            f" In {which}, a click on an edge shows the image along it, with the fitted line and"
-            " its standard deviation."
-        )
-    return text
+    return text + ("; last those that were held out." if album.held_out else ".")
+
+
+def _strips_hint(album: Album) -> tuple[Hint, ...]:
+    """How to see the strips along the edges, of an album with some."""
+    n, strips = len(album.images), sum(bool(one.strips) for one in album.images)
+    which = "every image" if strips == n else count(strips, "image")
+    text = (
+        f"In {which}, a click on an edge shows the image along it, with the fitted line and its"
+        " standard deviation."
+    )
+    return (Hint(text=text),) if strips else ()
 
 
 def _legend_text(album: Album) -> str:
@@ -130,8 +136,9 @@ def _legend_text(album: Album) -> str:
         " below a half.",
         "rejected": "Dotted: edges that were searched and rejected.",
         "joints": "Circles: joints of the calibrated machine; crosses: of the nominal model.",
-        "corners": "Small circles: detected corners of the board; arrows: to where the calibrated"
-        f" machine expects them, {album.factor:g} times as long as they are.",
+        "corners": "Small circles: detected corners of the board.",
+        "residuals": "Arrows: from what was measured to where the calibrated machine expects it,"
+        f" {album.factor:g} times as long as they are.",
     }
     return " ".join(text for name, text in texts.items() if _has(album, name))
 
@@ -312,7 +319,8 @@ def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
 class _ImageOverlays:
     """Overlays of the chosen images, computed for all images of a station at once.
 
-    factor : enlargement of the corners' residuals.
+    residuals : arrows of the edges, from measured to expected, at their middles.
+    factor : enlargement of the residuals.
     """
 
     def __init__(
@@ -325,15 +333,12 @@ class _ImageOverlays:
         self.calibration = calibration
         session, estimate = calibration.session, calibration.estimate
         self.edges: dict[Place, dict[int, EdgeCurve]] = defaultdict(dict)
+        self.residuals: dict[Place, list[blocks.Arrow]] = defaultdict(list)
         self.missed: dict[Place, list[EdgeCurve]] = defaultdict(list)
         self.strips: dict[Place, tuple[tuple[blocks.Strip, ...], str]] = {}
         self.spots: dict[Place, list[Spot]] = defaultdict(list)
         self.reasons: dict[Place, list[str]] = defaultdict(list)
         self.corners = board_corners(session, calibration.boards, estimate)
-        width = max((s.camera.image_size[0] for s in session.stations), default=0)
-        self.factor = enlargement(
-            np.linalg.norm(self.corners.off, axis=1), CORNER_ARROW_LENGTH * width
-        )
         # rejections by station; whole images have no leg
         rejected: dict[int, list[Rejection]] = defaultdict(list)
         for one in calibration.observation.rejected:
@@ -351,6 +356,10 @@ class _ImageOverlays:
                 self._edges(shifts, s, configurations)
                 self._missed(rejected[s], s, configurations)
                 self._spots(centres, s, configurations)
+        arrows = [one.displacement for some in self.residuals.values() for one in some]
+        lengths = np.hypot(*np.concatenate([self.corners.off, np.reshape(arrows, (-1, 2))]).T)
+        width = max((s.camera.image_size[0] for s in session.stations), default=0)
+        self.factor = enlargement(lengths, RESIDUAL_ARROW_LENGTH * width)
 
     def add_strips(
         self,
@@ -404,7 +413,7 @@ class _ImageOverlays:
         layers = (
             edge_layer("rejected", missed),
             edge_layer("edges", edges),
-            *self._corner_layers(mine),
+            *self._corner_layers(mine, self.residuals[s, k]),
             *joint_layers(self.spots[s, k]),
         )
         strips, sheet = self.strips.get((s, k), ((), ""))
@@ -419,13 +428,15 @@ class _ImageOverlays:
     def _use(self, configuration: int, level: float) -> str:
         """What is used of an image. level : of its residuals, NaN without any."""
         if np.isfinite(level):
-            return f"residuals {number(level, 2)} σ"
+            return f"residuals {number(level, 2)}\N{NO-BREAK SPACE}σ"
         out = self.calibration.holdout
         return "held out" if out and configuration in out.region.rows else "nothing in use"
 
-    def _corner_layers(self, corners: BoardCorners) -> tuple[blocks.Layer, blocks.Layer]:
-        """Detected corners, and arrows from there to where they are predicted."""
-        rings, arrows = list[blocks.Shape](), list[blocks.Shape]()
+    def _corner_layers(
+        self, corners: BoardCorners, of_edges: Sequence[blocks.Arrow]
+    ) -> tuple[blocks.Layer, blocks.Layer]:
+        """Detected corners, and arrows to where they are predicted, with those of the edges."""
+        rings, arrows = list[blocks.Shape](), list[blocks.Shape](of_edges)
         for n in range(len(corners)):
             (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
             tip = (
@@ -462,6 +473,19 @@ class _ImageOverlays:
             drawn = polyline(leg, points, weight < INLIER_WEIGHT, tip)
             if drawn:
                 self.edges[s, int(edges.configuration[n])][n] = drawn
+        # residuals at the middles of the edges
+        offsets = edge_offsets(self.calibration.session, edges, estimate, s, mine)
+        middle = np.arange(len(mine)) * len(FIELD_EDGE_FRACTIONS) + len(FIELD_EDGE_FRACTIONS) // 2
+        off = (offsets.value[:, None] * offsets.direction)[middle]
+        measured = offsets.pixel[middle] + off
+        for n, (x, y), (dx, dy) in zip(mine.tolist(), measured.tolist(), off.tolist(), strict=True):
+            if np.isfinite([x, y, dx, dy]).all():
+                arrow = blocks.Arrow(
+                    at=(round(x, 1), round(y, 1)),
+                    displacement=(round(-dx, 3), round(-dy, 3)),
+                    dashed=bool(estimate.edge_weights[n] < INLIER_WEIGHT),
+                )
+                self.residuals[s, int(edges.configuration[n])].append(arrow)
 
     def _missed(self, rejected: list[Rejection], s: int, configurations: Integers) -> None:
         """Collect predictions of rejected edges, each with the reason."""

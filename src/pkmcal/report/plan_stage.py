@@ -12,6 +12,7 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import configuration_key
 from pkmcal.outcome.blocks.space import Space, SpacePoints
+from pkmcal.outcome.blocks.text import Hint
 from pkmcal.planning.plan import MeasurementPlan, TriedStation
 from pkmcal.report.space import space_points, space_poses
 from pkmcal.web.motion import Postures
@@ -35,8 +36,8 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
         points.append(_candidates(plan.tried))
     block = Space(
         title="",
-        caption="The slider takes the machine through the configurations in their order; points are"
-        " the platform's positions, by the stations that measure them."
+        caption="The machine at a configuration; points are the platform's positions, by the"
+        " stations that measure them."
         + (" The larger a camera's place, the better it is alone." if plan.tried else ""),
         alt="The machine in three dimensions at the configurations of the plan, with the cameras.",
         machine=machine_shape(
@@ -48,7 +49,8 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
         poses=space_poses(machine, postures, plan.names, configuration_key),
         points=tuple(points),
     )
-    return Part("where", "In space", blocks=(block,))
+    hint = Hint(text="The slider takes the machine through the configurations in their order.")
+    return Part("where", "In space", blocks=(block, hint))
 
 
 def _by_station(plan: MeasurementPlan) -> list[SpacePoints]:

@@ -198,7 +198,7 @@ def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -
         rows.append(Row(session.station_names[poses.station[k]], cells))
     columns = ("Station", "Configuration", "Off, mm", "Turned, °", "In σ", "Use")
     title = "The poses that fit worst"
-    return Table(title, columns, tuple(rows), brief=False, words=(1, 5))
+    return Table(title, columns, tuple(rows), brief=False, folded=True, words=(1, 5))
 
 
 def target_places(observation: Observation, estimate: Estimate) -> tuple[Array, Integers]:

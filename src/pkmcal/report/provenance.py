@@ -175,9 +175,6 @@ def certificate(calibration: Calibration, digest: str) -> tuple[tuple[str, str],
         (f"Tracker {table.name}", f"{table.kind}, {count(len(table.configuration), 'row')}")
         for table in session.trackers
     )
-    noise = " or ".join(
-        amount(session.joint_noise, unit) for unit in dict.fromkeys(session.machine.joint_units)
-    )
     every = (
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
         ("Session", session.folder.name),
@@ -185,7 +182,7 @@ def certificate(calibration: Calibration, digest: str) -> tuple[tuple[str, str],
         ("Method", calibration.method),
         ("Configurations", str(int(np.sum(calibration.estimate.configurations)))),
         (TOLERANCES_NAME, _tolerances(tolerance)),
-        (READING_NOISE_NAME, noise),
+        (READING_NOISE_NAME, _reading_noise(session)),
         *cameras,
         *trackers,
     )
@@ -198,14 +195,13 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     tolerance = session.machine.document.tolerance
     noise = estimate.edge_noise
     tubes = zip(noise.scale, noise.shading, noise.dof, strict=True)
-    units = dict.fromkeys(session.machine.joint_units)
     groups = [one._replace(name=group_label(session, one.name)) for one in s.groups]
     nominal = GroupStatistics("nominal model", 1.0, s.chi2_drawing, s.n_drawing, 0.0, None, None)
     return (
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
         ("Frames", estimate.gauge),
-        (READING_NOISE_NAME, f"{session.joint_noise:.3g} {' or '.join(units)}"),
+        (READING_NOISE_NAME, _reading_noise(session)),
         (TOLERANCES_NAME, _tolerances(tolerance)),
         ("Solver", f"{count(s.steps, 'step')}; {s.stopped}"),
         *(
@@ -246,6 +242,12 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             for low, high in [one.noise_range]
         ),
     )
+
+
+def _reading_noise(session: Session) -> str:
+    """Standard deviation of a reading, once for each unit of the joints."""
+    units = dict.fromkeys(session.machine.joint_units)
+    return " or ".join(amount(session.joint_noise, unit) for unit in units)
 
 
 def _tolerances(tolerance: NominalTolerance) -> str:

@@ -12,6 +12,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import configuration_key
 from pkmcal.outcome.blocks.space import Space, SpaceArrows, SpacePoints
+from pkmcal.outcome.blocks.text import Hint
 from pkmcal.report.space import (
     ELLIPSOID_SIGMAS,
     changes,
@@ -56,7 +57,8 @@ def section(
     change, spread = start_enlargements(extent_of(machine, first), centres)
     block = Space(
         title="",
-        caption=_caption(len(some), len(used), imaged=bool(session.stations)),
+        caption="True to scale, except for the change of the joint centres from the nominal model"
+        f" (blue) and their {ELLIPSOID_SIGMAS:g}σ ellipsoids, which are enlarged.",
         alt="The calibrated machine in three dimensions with"
         + (" its tubes, the fields of view of its cameras," if session.stations else "")
         + " the measured poses, and the joint centres of the nominal model.",
@@ -83,19 +85,13 @@ def section(
         points=_points(session, estimate, targets),
         arrows=arrows,
     )
-    return Part("geometry", "The machine in space", blocks=(block,), menu="Geometry")
-
-
-def _caption(drawn: int, used: int, *, imaged: bool) -> str:
-    """Sentences below the stage."""
-    fewer = f" of {used}, evenly chosen" if drawn < used else ""
-    return (
-        "True to scale, except for the change of the joint centres from the nominal model (blue)"
-        f" and their {ELLIPSOID_SIGMAS:g}σ ellipsoids, which are enlarged by the sliders."
-        f" The slider takes the machine through {count(drawn, 'pose')}{fewer};"
-        + (" a click on a pose's point leads to its images, and" if imaged else "")
+    fewer = f" of {len(used)}, evenly chosen" if len(some) < len(used) else ""
+    hint = Hint(
+        text=f"The slider takes the machine through {count(len(some), 'pose')}{fewer};"
+        + (" a click on a pose's point leads to its images, and" if session.stations else "")
         + " the space bar changes between nominal model and result."
     )
+    return Part("geometry", "The machine in space", blocks=(block, hint), menu="Geometry")
 
 
 def tool_arrows(tool_map: ToolMap) -> SpaceArrows:
@@ -123,7 +119,7 @@ def _points(
         ("Measured poses", "--calibrated", places, used)
     ]
     if len(targets[0]):
-        every.append(("Measured targets", "--drawing", *targets))
+        every.append(("Measured targets", "--accent", *targets))
     out: list[SpacePoints] = []
     for name, colour, at, configuration in every:
         names = [session.configurations[k] for k in configuration]

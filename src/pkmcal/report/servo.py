@@ -20,7 +20,7 @@ from pkmcal.report.servo_plots import (
     shares,
     tail_plot,
 )
-from pkmcal.wording import brief
+from pkmcal.wording import amount, brief
 
 SERVO_METHOD_TEXT = (
     "The camera measures the edges of one tube of each seen leg. The error is the cross product of"
@@ -209,8 +209,9 @@ def settings_table(study: Study) -> Table:
     """Table of the simulation's settings."""
     s, units = _settings(study), dict.fromkeys(study.eye.true.machine.joint_units)
     s |= {
-        "hand_position": 1e3 * s["hand_position"],
-        "hand_rotation": float(np.degrees(s["hand_rotation"])),
+        "joint_noise": " or ".join(amount(s["joint_noise"], unit) for unit in units),
+        "hand_position": amount(s["hand_position"], "m"),
+        "hand_rotation": amount(s["hand_rotation"], "rad"),
     }
     names = {
         "law": "Control by",
@@ -219,11 +220,11 @@ def settings_table(study: Study) -> Table:
         "rate": "Images a second",
         "delay": "Delay, images",
         "noise": "Noise of an edge, px",
-        "joint_noise": f"Noise of a reading, {' or '.join(units)}",
+        "joint_noise": "Noise of a joint reading",
         "speed": f"Fastest drive, {' or '.join(f'{unit}/s' for unit in units)}",
         "duration": "Time of a run, s",
-        "hand_position": "Camera's place by hand, off by mm",
-        "hand_rotation": "and by °",
+        "hand_position": "Position error of the camera by hand",
+        "hand_rotation": "Orientation error of the camera by hand",
         "runs": "Runs of every estimate",
         "seed": "Seed",
     }

@@ -21,7 +21,7 @@ from pkmcal.outcome.blocks.plot import (
     panels,
     rounded,
 )
-from pkmcal.outcome.blocks.text import Paragraph
+from pkmcal.outcome.blocks.text import Hint, Paragraph
 from pkmcal.report.charts import NORMAL_90, bar_plot, box, row_plot
 from pkmcal.report.pictures import images_of_configurations
 from pkmcal.session.load import Session
@@ -188,12 +188,12 @@ def _images(judged: NominalComparison, v: Validation) -> Part | None:
     n = len(judged.rows)
     text = (
         f"Of the {count(n, 'judged configuration')}, the one with the largest residuals first."
-        " Lines: measured edges in their leg's colour, dashed where they were rejected. A click on"
-        " a bar of the chart above leads to its image."
+        " Lines: measured edges in their leg's colour, dashed where they were rejected."
     )
+    hint = "A click on a bar of the chart above leads to its image."
     legs = v.session.machine.n_legs if any(one.overlays for one in images) else 0
     block = Images(images=images, first=FIRST_IMAGES, legs=legs)
-    return Part("photographs", "Images", blocks=(Paragraph(text=text), block))
+    return Part("photographs", "Images", blocks=(Paragraph(text=text), Hint(text=hint), block))
 
 
 def _worst(judged: NominalComparison, session: Session) -> tuple[str, ...]:

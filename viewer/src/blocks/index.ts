@@ -9,7 +9,7 @@ import { logBar } from "./log_bar";
 import { panels, plot } from "./plot";
 import { space } from "./space";
 import { dataTable } from "./table";
-import { downloads, facts, listing, paragraph } from "./text";
+import { downloads, facts, hint, listing, paragraph } from "./text";
 import { tool_map } from "./tool_map";
 
 export type Block = Section["blocks"][number];
@@ -25,6 +25,7 @@ type Drawers = { [K in Block["kind"]]: (block: Of<K>, context: Context) => HTMLE
 
 const DRAWERS: Drawers = {
   paragraph,
+  hint,
   listing,
   facts,
   downloads,

@@ -25,8 +25,8 @@ export function logBar(block: LogBar): HTMLElement {
       ]),
       h("dt", { "aria-hidden": "true" }),
       h("dd", { class: "axis", "aria-hidden": "true" },
-        h("span", { class: "track" }, ...decades.map((decade) => at(h("span", {}, tick(decade)), decade))),
-        h("span", { class: "unit" }, block.unit))),
+        h("span", { class: "track" }, ...decades.map((decade) =>
+          at(h("span", {}, decade === high ? `${tick(decade)} ${block.unit}` : tick(decade)), decade))))),
     ...(block.note ? [h("p", { class: "small" }, block.note)] : []));
 }
 

@@ -35,8 +35,8 @@ interface Size {
 const LETTER = 6.8, ROW = 22;
 /** Share of a plot's width that names of rows may take. */
 const MOST_NAMES = 0.4;
-/** Widths of a plot on paper, px: alone, and of two side by side. */
-const PAPER_WIDTH = 640, PAPER_PANEL_WIDTH = 400;
+/** Widths of a plot on paper, px: alone, of two side by side, and of one with equal scales. */
+const PAPER_WIDTH = 560, PAPER_PANEL_WIDTH = 400, PAPER_EQUAL_WIDTH = 460;
 const PANEL_HEIGHT = 220, WIDE_HEIGHT = 320, HIGHEST = 620, WIDE = 560;
 /** Part of a category's place that bars leave free, at each side. */
 const GAP = 0.12;
@@ -45,11 +45,14 @@ const LONGEST_NAME = 12;
 const COLOUR_STEPS = 20;
 
 export function panels(block: Panels, context: Context): HTMLElement {
-  const width = block.plots.length > 1 ? PAPER_PANEL_WIDTH : PAPER_WIDTH;
-  return h("div", { class: "panels" }, ...block.plots.map((one) => plot(one, context, width)));
+  const several = block.plots.length > 1;
+  return h("div", { class: "panels" },
+    ...block.plots.map((one) => plot(one, context, several ? PAPER_PANEL_WIDTH : aloneOnPaper(one))));
 }
 
-export function plot(block: PlotBlock, { selection, printSteps }: Context, paperWidth = PAPER_WIDTH): HTMLElement {
+const aloneOnPaper = (block: PlotBlock): number => (block.equal ? PAPER_EQUAL_WIDTH : PAPER_WIDTH);
+
+export function plot(block: PlotBlock, { selection, printSteps }: Context, paperWidth = aloneOnPaper(block)): HTMLElement {
   const area = h("div", { class: "area" });
   let drawn = 0;
   const draw = (width: number) => {

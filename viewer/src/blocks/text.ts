@@ -1,10 +1,12 @@
 /** Blocks of text. */
 
-import type { Downloads, Facts, Listing, Paragraph } from "../document";
+import type { Downloads, Facts, Hint, Listing, Paragraph } from "../document";
 import { h, prose } from "../dom";
 
 export const paragraph = (block: Paragraph): HTMLElement =>
   h("p", block.small ? { class: "small" } : {}, ...prose(block.text));
+
+export const hint = (block: Hint): HTMLElement => h("p", { class: "small hint" }, ...prose(block.text));
 
 export function listing(block: Listing): HTMLElement {
   const items = h("ul", { class: "listing" }, ...block.items.map((text) => {

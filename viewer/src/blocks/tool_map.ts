@@ -20,7 +20,7 @@ const LABEL_SPACE = 34; // between the labels of contour lines
 type Grid = (number | null)[][];
 let count = 0;
 
-export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLElement {
+export function tool_map(block: ToolMapBlock, { selection, printSteps }: Context): HTMLElement {
   const names = [...new Set(block.layers.map((one) => one.name))];
   const components = [...new Set(block.layers.map((one) => one.component))];
   const middle = Math.floor((block.slices.filter((one) => one.normal === block.slices[0].normal).length - 1) / 2);
@@ -52,7 +52,7 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
   const value = h("p", { class: "small map-value" });
   const good = h("span", {});
 
-  const draw = (withLimit = true): void => {
+  const draw = (withLimit = true, width = matchMedia("(max-width: 600px)").matches ? WIDTH.narrow : WIDTH.wide): void => {
     const one = layer();
     const wanted = limits.get(limitKey(one)) ?? one.limit;
     const slice = block.slices[state.slice];
@@ -63,7 +63,7 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
     unit.textContent = one.unit || "×";
     const within = one.evenly.filter((x) => (one.better === "small" ? x <= wanted : x >= wanted)).length;
     share.textContent = `${number((100 * within) / Math.max(one.evenly.length, 1), 0)} % of the workspace`;
-    const { picture, at } = map(slice, one, one.slices[state.slice] as Grid, wanted, block);
+    const { picture, at } = map(slice, one, one.slices[state.slice] as Grid, wanted, block, width);
     picture.addEventListener("pointermove", (event) => (value.textContent = at(event)));
     picture.addEventListener("pointerleave", () => (value.textContent = ""));
     picture.addEventListener("click", (event) => {
@@ -83,6 +83,11 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
           text)));
   };
   draw();
+  // on paper the map has half of the width
+  printSteps.push(() => {
+    draw(true, WIDTH.narrow);
+    return () => draw();
+  });
   return h("figure", { class: "map-block" },
     h("div", { class: "bar" },
       radio("Quantity", names, state.name, (one) => {
@@ -138,9 +143,8 @@ function filled(grid: Grid): number[] {
       (one.x - x) ** 2 + (one.y - y) ** 2 < (best.x - x) ** 2 + (best.y - y) ** 2 ? one : best).z));
 }
 
-function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, block: ToolMapBlock) {
+function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, block: ToolMapBlock, width: number) {
   const { u, v } = slice;
-  const width = matchMedia("(max-width: 600px)").matches ? WIDTH.narrow : WIDTH.wide;
   const [du, dv] = [u, v].map((w) => (w.length > 1 ? w[1] - w[0] : 1));
   const scale = (width - LEFT - RIGHT) / (du * u.length);
   const height = TOP + dv * v.length * scale + BOTTOM;

@@ -152,11 +152,11 @@ class SessionView {
     this.listen();
   }
 
-  /** Show the image of the address, or the first one. */
+  /** Show the image and machine of the address, or the first image and what its calibration found. */
   open(): void {
     const { stations, calibration } = this.content;
     const [s, k, machine] = location.hash.slice(1).split("/");
-    if (calibration && machine === "calibration") this.setMachine("calibration");
+    if (calibration && machine !== "nominal") this.setMachine("calibration");
     const first = stations.findIndex((station) => station.images.length);
     if (first < 0) this.notify("The session has no images.", "bad");
     else if (stations[Number(s) - 1]?.images[Number(k) - 1]) this.go(Number(s) - 1, Number(k) - 1);

@@ -15,11 +15,12 @@ from pkmcal.outcome.blocks.log_bar import LogBar
 from pkmcal.outcome.blocks.plot import Panels, Plot
 from pkmcal.outcome.blocks.space import Space
 from pkmcal.outcome.blocks.table import DataTable
-from pkmcal.outcome.blocks.text import Downloads, Facts, Listing, Paragraph
+from pkmcal.outcome.blocks.text import Downloads, Facts, Hint, Listing, Paragraph
 from pkmcal.outcome.blocks.tool_map import ToolMapBlock
 
 Block = Annotated[
     Paragraph
+    | Hint
     | Listing
     | Facts
     | Downloads

@@ -7,7 +7,7 @@ the image upright.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -18,21 +18,30 @@ Pixel = tuple[float, float]
 LayerName = Literal["machine", "edges", "rejected", "joints", "nominal", "corners", "residuals"]
 
 
+def omitted(default: Any) -> Any:
+    """Field that documents omit where it has its default; a page has thousands of shapes."""
+    return Field(
+        default,
+        exclude_if=lambda value: value == default,
+        json_schema_extra={"omittedAtDefault": True},
+    )
+
+
 class Polyline(Schema):
     """Curve in an image.
 
     key : what it belongs to; a leg's key gives the colour.
     tip : tooltip.
     dashed : measured, but not in use.
-    strip : index of its strip in the image's ``strips``, null without one.
+    strip : index of its strip in the image's ``strips``, absent without one.
     """
 
     shape: Literal["polyline"] = "polyline"
     points: tuple[Pixel, ...]
-    key: Key = ""
-    tip: Text = ""
-    dashed: bool = False
-    strip: int | None = None
+    key: Key = omitted("")
+    tip: Text = omitted("")
+    dashed: bool = omitted(False)
+    strip: int | None = omitted(None)
 
 
 class Ring(Schema):
@@ -44,11 +53,11 @@ class Ring(Schema):
 
     shape: Literal["ring"] = "ring"
     at: Pixel
-    key: Key = ""
-    tip: Text = ""
-    dashed: bool = False
-    label: Text = ""
-    filled: bool = False
+    key: Key = omitted("")
+    tip: Text = omitted("")
+    dashed: bool = omitted(False)
+    label: Text = omitted("")
+    filled: bool = omitted(False)
 
 
 class Cross(Schema):
@@ -56,8 +65,8 @@ class Cross(Schema):
 
     shape: Literal["cross"] = "cross"
     at: Pixel
-    key: Key = ""
-    tip: Text = ""
+    key: Key = omitted("")
+    tip: Text = omitted("")
 
 
 class Arrow(Schema):
@@ -71,10 +80,10 @@ class Arrow(Schema):
     shape: Literal["arrow"] = "arrow"
     at: Pixel
     displacement: Pixel
-    key: Key = ""
-    tip: Text = ""
-    dashed: bool = False
-    label: Text = ""
+    key: Key = omitted("")
+    tip: Text = omitted("")
+    dashed: bool = omitted(False)
+    label: Text = omitted("")
 
 
 Shape = Annotated[Polyline | Ring | Cross | Arrow, Field(discriminator="shape")]

@@ -16,6 +16,13 @@ class Paragraph(Schema):
     small: bool = False
 
 
+class Hint(Schema):
+    """How to use the page, in small print; not on paper."""
+
+    kind: Literal["hint"] = "hint"
+    text: Text
+
+
 class Listing(Schema):
     """List with a heading, which may be empty.
 
