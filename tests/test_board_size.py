@@ -145,6 +145,20 @@ def test_a_hint_states_the_size_of_everything_else(size):
     assert abs(value - size) < 3 * sigma
 
 
+@pytest.mark.parametrize("share", [0.999999, 1.0, 1.2])
+def test_data_that_do_not_determine_the_size_give_no_number(share):
+    """A standard deviation of the file's size: what else there is says nothing of it."""
+    data = SimpleNamespace(mounts=(Mount("board", "platform", TOLERANCE),))
+    estimate = SimpleNamespace(
+        state=SimpleNamespace(columns={BOARD_SIZE: np.array([-0.4 * TOLERANCE])}),
+        column_sigma=lambda _code: np.array([share * TOLERANCE]),
+    )
+    session = SimpleNamespace(document={"board": {"file": "board.yaml"}})
+    (information,) = size_notes(session, data, estimate)
+    assert information.code == "board.size_by_file"
+    assert set(information.facts) == {"tolerance"}
+
+
 def test_files_say_how_well_the_size_is_known():
     fields = {"type": "chessboard", "corners": [7, 6], "square": 0.03}
 

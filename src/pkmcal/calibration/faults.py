@@ -19,7 +19,7 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.start import start_state
 from pkmcal.identify.verdict import VERDICT, RicherModel
-from pkmcal.levels import MAJORITY, NOISE_EXCESS, OUTLIER_SIGMAS
+from pkmcal.levels import MAJORITY, NEGLIGIBLE, NOISE_EXCESS, OUTLIER_SIGMAS
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
@@ -237,9 +237,10 @@ def size_notes(
             yield note("board.size_estimate", file, value=value, sigma=sigma)
             continue
         # the prior, which is the file's, is removed: 1 / other is the factor on the estimate
-        other = max(1 - (sigma / tolerance) ** 2, np.finfo(float).eps)
+        other = 1 - (sigma / tolerance) ** 2
         facts = {"tolerance": 100 * tolerance}
-        if abs(value) / np.sqrt(other) > OUTLIER_SIGMAS * tolerance:
+        # where the data's share is negligible, as with noise scaled beyond the file's, they give none
+        if other > NEGLIGIBLE and abs(value) / np.sqrt(other) > OUTLIER_SIGMAS * tolerance:
             facts |= {"value": value / other, "sigma": sigma / np.sqrt(other)}
             yield note("board.size_disagrees", file, **facts)
         else:
