@@ -239,7 +239,7 @@ def size_notes(
         # the prior, which is the file's, is removed: 1 / other is the factor on the estimate
         other = 1 - (sigma / tolerance) ** 2
         facts = {"tolerance": 100 * tolerance}
-        # where the data's share is negligible, as with noise scaled beyond the file's, they give none
+        # data with a negligible share, as with noise scaled beyond the file's, give no number
         if other > NEGLIGIBLE and abs(value) / np.sqrt(other) > OUTLIER_SIGMAS * tolerance:
             facts |= {"value": value / other, "sigma": sigma / np.sqrt(other)}
             yield note("board.size_disagrees", file, **facts)
