@@ -51,11 +51,12 @@ from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.background import Landmarks, Neighbour, Surroundings
-from pkmcal.observe.distance_tables import distance_tables
+from pkmcal.observe.distance_tables import DistanceTables, distance_tables
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.image_localization import (
     IMAGE_LOCALIZATION_OPTIONS,
     PoseHypotheses,
+    finest_tables,
     finest_view,
     localize_along,
     localize_image,
@@ -483,7 +484,7 @@ def _search(
     little, and by the background of each of its neighbours. Poses that were scored with a similar
     machine are not scored again.
     """
-    p, scene, placed, k = image, so_far.scene, so_far.placed, image.station
+    p, scene, placed, k = image.decoded(), so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
     anew = before.anew or (scene.prior is not None and before.scores is not None)
     if anew and not before.anew:
@@ -495,6 +496,7 @@ def _search(
         and scene.prior.like(before.by)
     ):
         scores, by, beside = before.scores, before.by, before.beside
+    tables = finest_tables(p)
     # further candidates: from landmarks, from the last scoring, and from the background
     likely = before.places.T_camera_base[: _OPTIONS.scored_again]
     others = np.concatenate([room.place(k, so_far.landmarks), likely])
@@ -502,24 +504,28 @@ def _search(
         axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
     if placed and anew:
-        others = np.concatenate([others, _by_neighbours(session, room, so_far, p)])
+        others = np.concatenate([others, _by_neighbours(session, room, so_far, p, tables)])
     # joint estimate, then the background
-    closer, scores = rescore_poses(session, p, scene, alone, others, scores)
+    closer, scores = rescore_poses(session, p, scene, alone, others, scores, tables)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
     return _CachedHypotheses(alone, places, scores, by, beside, anew)
 
 
 def _by_neighbours(
-    session: Session, room: Surroundings, so_far: _LocalizationState, image: StationImages
+    session: Session,
+    room: Surroundings,
+    so_far: _LocalizationState,
+    image: StationImages,
+    tables: DistanceTables,
 ) -> Array:
     """Poses (n, 4, 4) of an image by the background of each of its neighbours, at the distance
     from it at which the legs match best.
     """
-    p, scene = image.decoded(), so_far.scene
+    p, scene = image, so_far.scene
     away = [np.linalg.norm(one.T_camera_base[:3, 3]) for one in so_far.placed.values()]
     lines = room.relative(p.station, so_far.placed, _OPTIONS.apart * float(np.median(away)))
-    view = finest_view(scene.machine, p, session.joints, scene.T_base_platform)
+    view = finest_view(scene.machine, p, session.joints, scene.T_base_platform, tables)
     return localize_along(view, lines, legs.LEG_SEARCH_OPTIONS.sigma)
 
 
