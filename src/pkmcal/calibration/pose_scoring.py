@@ -130,9 +130,9 @@ def _silhouettes(
 
     stations = sorted(places)
     with ThreadPoolExecutor(THREADS) as pool:
-        measured = dict(zip(stations, pool.map(measure, stations), strict=True))
-    poses, edges = ({k: one[n] for k, one in measured.items()} for n in range(2))
-    return poses, edges
+        measured = list(pool.map(measure, stations))
+    poses = {k: T for k, (T, _) in zip(stations, measured, strict=True)}
+    return poses, {k: edges for k, (_, edges) in zip(stations, measured, strict=True)}
 
 
 def evaluate_pose(

@@ -613,7 +613,10 @@ def _distances(
     shape = (len(values), -1, values.shape[-1])
     inside = np.broadcast_to(inside, values.shape)
     chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
-    length = np.hypot(chord[..., 0], chord[..., 1])
+    # at most the image's diagonal: of an edge that passes close to the camera a single point may
+    # lie in the image, and would count as thousands of pixels of silhouette
+    diagonal = np.float32(np.hypot(*view.camera.image_size))
+    length = np.minimum(np.hypot(chord[..., 0], chord[..., 1]), diagonal)
     length /= np.float32(view.tables.scale * (shape[-1] - 1))
     return Distances(
         np.where(inside, values, DISTANCE_OUTSIDE_IMAGE).reshape(shape),
