@@ -614,9 +614,10 @@ def _distances(
     inside = np.broadcast_to(inside, values.shape)
     chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
     # at most the image's diagonal: of an edge that passes close to the camera a single point may
-    # lie in the image, and would count as thousands of pixels of silhouette
+    # lie in the image, and would count as thousands of pixels of silhouette; NaN if an end of the
+    # edge has no image
     diagonal = np.float32(np.hypot(*view.camera.image_size))
-    length = np.minimum(np.hypot(chord[..., 0], chord[..., 1]), diagonal)
+    length = np.fmin(np.hypot(chord[..., 0], chord[..., 1]), diagonal)
     length /= np.float32(view.tables.scale * (shape[-1] - 1))
     return Distances(
         np.where(inside, values, DISTANCE_OUTSIDE_IMAGE).reshape(shape),
