@@ -599,8 +599,11 @@ def _rival_probabilities(
     apart : images whose hypotheses are weighed by other evidence too, a board or a person; they are
         compared with their own second one only.
     """
-    alike = [one for k, one in hypotheses.items() if k not in apart]
-    rivals = [one.log_likelihood_ratio[1] / one.unit for one in alike if len(one.T_camera_base) > 1]
+    rivals = [
+        one.log_likelihood_ratio[1] / one.unit
+        for k, one in hypotheses.items()
+        if k not in apart and len(one.T_camera_base) > 1
+    ]
     usual = float(np.median(rivals)) if rivals else 0.0
     out: dict[int, float] = {}
     for k, one in hypotheses.items():
