@@ -668,6 +668,18 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
     assert handheld._sure({}, 5) == []
 
 
+def test_a_pose_is_not_believed_that_fits_as_wrong_ones_of_other_images_do():
+    """The correct pose may be missing among the hypotheses; a board or a person excludes that."""
+    scores = [[20.0, 10.0], [25.0, 11.0], [18.0, 9.0], [8.0, 1.0], [8.0]]
+    one = {
+        k: PoseHypotheses(np.stack([np.eye(4)] * len(score)), np.array(score), 1.0)
+        for k, score in enumerate(scores)
+    }
+    assert one[3].rival_probability < 1e-3
+    assert handheld._sure(one, 5) == [1, 0, 2]
+    assert sorted(handheld._sure(one, 5, apart={3, 4})) == [0, 1, 2, 3, 4]
+
+
 def stated(searched, numbers=(0, 1, 2)):
     """The session with rough poses of some images."""
     session, images, poses, truth = searched

@@ -152,6 +152,18 @@ def test_an_image_edge_is_evidence_for_one_of_two_legs_behind_each_other():
     assert np.array_equal(after[:, leg > 1], before[:, leg > 1])
 
 
+def test_a_leg_close_to_the_camera_counts_no_longer_than_the_image():
+    """Its silhouette is mostly outside; the points inside stand for what may be inside."""
+    view, rng = view_of(images()[:1]), np.random.default_rng(0)
+    # cameras among the legs
+    eye = rng.uniform((-0.3, -0.3, 0.0), (0.3, 0.3, 0.3), (300, 3))
+    turn = rotation(rng.normal(size=(300, 3)))
+    among = pose(turn, -(turn @ eye[..., None])[..., 0])
+    found = pose_likelihood.distances_under(view, among, np.zeros(1, dtype=int), 8)
+    diagonal = np.hypot(*view.camera.image_size) / view.tables.scale
+    assert found.length.max() == pytest.approx(diagonal / 7)
+
+
 def norm(vectors):
     return np.linalg.norm(vectors, axis=-1, keepdims=True)
 

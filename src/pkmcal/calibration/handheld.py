@@ -15,7 +15,7 @@ joint estimate rejects: their pose was wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -51,11 +51,12 @@ from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.background import Landmarks, Neighbour, Surroundings
-from pkmcal.observe.distance_tables import distance_tables
+from pkmcal.observe.distance_tables import DistanceTables, distance_tables
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.image_localization import (
     IMAGE_LOCALIZATION_OPTIONS,
     PoseHypotheses,
+    finest_tables,
     finest_view,
     localize_along,
     localize_image,
@@ -142,7 +143,7 @@ class Localization:
 def localization_share(session: Session) -> float:
     """Share of a calibration's time that the localization of its images takes, about."""
     by_hand = [station.handheld for station in session.stations]
-    return 0.25 + 0.5 * sum(by_hand) / max(len(by_hand), 1)
+    return 0.25 + 0.65 * sum(by_hand) / max(len(by_hand), 1)
 
 
 def localize_case(
@@ -190,10 +191,12 @@ def localize(
             session, images, boards, scene, part(progress, 1 - by_hand, 1)
         )
         nowhere = {k for k in places if np.isnan(scene.T_camera_base[k]).any()}
-        sure = _sure(places, len(places))
+        apart = _apart(session, boards)
+        sure = _sure(places, len(places), apart)
+        rivals = _rival_probabilities(places, apart)
         # an image with a certain pose has none in the scene if too few legs were measured there
         few_legs = few_legs_reason(scene.machine)
-        lost = {k: few_legs if k in sure else why_lost(places[k]) for k in nowhere}
+        lost = {k: few_legs if k in sure else why_lost(places[k], rivals[k]) for k in nowhere}
         for k in sorted(places.keys() & scene.edges.keys()):
             turn = angle_between(scene.T_camera_base[k], places[k].T_camera_base[0])
             if turn > _OPTIONS.most_turn and k in sure:
@@ -246,6 +249,7 @@ def _searched(
     at = {p.station: p.select(first) for p in images}
     stated, scene = _with_stated(session, scene, at)
     by_hand = [k for k in at if session.stations[k].handheld and k not in stated]
+    apart = _apart(session, boards)
     room = Surroundings(list(at), lambda k: (at[k].images[0], at[k].camera))
     answers: dict[int, _CachedHypotheses] = {}
     so_far = _LocalizationState(scene)
@@ -264,7 +268,7 @@ def _searched(
 
     def accepted_poses() -> Array:
         return _accepted_poses(
-            hypotheses(), len(by_hand) + len(stated), boards, scene.T_camera_base
+            hypotheses(), len(by_hand) + len(stated), apart, boards, scene.T_camera_base
         )
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -279,16 +283,16 @@ def _searched(
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = min((len(clearer) + 1) // 2, _OPTIONS.most_from_nominal)
-        rescore(clearer[:half], "Scoring the least ambiguous images", part(progress, 0.3, 0.5))
+        rescore(clearer[:half], "Scoring the least ambiguous images", part(progress, 0.3, 0.42))
         so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
         text = f"Scoring the others, with {len(so_far.placed)} images localized"
-        rescore(clearer[half:], text, part(progress, 0.55, 0.7))
+        rescore(clearer[half:], text, part(progress, 0.47, 0.6))
         # join the images of a board, and score images without an accepted pose again
         for k, one in _on_board(hypotheses(), boards).items():
             if k in answers:  # poses that the session states remain
                 answers[k] = replace(answers[k], places=one)
         so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
-        rest = part(progress, 0.75, 1)
+        rest = part(progress, 0.65, 1)
         for _ in range(_OPTIONS.most_rounds):
             T = accepted_poses()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.with_few_legs]
@@ -321,6 +325,12 @@ def _with_stated(
         stated[k] = PoseHypotheses(near.T_camera_base[:1], near.log_likelihood_ratio[:1], near.unit)
         T_camera_base[k] = near.T_camera_base[0]
     return stated, scene._replace(T_camera_base=T_camera_base)
+
+
+def _apart(session: Session, boards: Boards) -> set[int]:
+    """Numbers of the stations whose poses a board or a person determines beside the legs."""
+    stated = {k for k, one in enumerate(session.stations) if one.T_camera_base is not None}
+    return stated | boards.stations.keys()
 
 
 def _final_poses(so_far: _LocalizationState, T_camera_base: Array, by_hand: Sequence[int]) -> Array:
@@ -483,7 +493,7 @@ def _search(
     little, and by the background of each of its neighbours. Poses that were scored with a similar
     machine are not scored again.
     """
-    p, scene, placed, k = image, so_far.scene, so_far.placed, image.station
+    p, scene, placed, k = image.decoded(), so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
     anew = before.anew or (scene.prior is not None and before.scores is not None)
     if anew and not before.anew:
@@ -495,6 +505,7 @@ def _search(
         and scene.prior.like(before.by)
     ):
         scores, by, beside = before.scores, before.by, before.beside
+    tables = finest_tables(p)
     # further candidates: from landmarks, from the last scoring, and from the background
     likely = before.places.T_camera_base[: _OPTIONS.scored_again]
     others = np.concatenate([room.place(k, so_far.landmarks), likely])
@@ -502,24 +513,28 @@ def _search(
         axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
     if placed and anew:
-        others = np.concatenate([others, _by_neighbours(session, room, so_far, p)])
+        others = np.concatenate([others, _by_neighbours(session, room, so_far, p, tables)])
     # joint estimate, then the background
-    closer, scores = rescore_poses(session, p, scene, alone, others, scores)
+    closer, scores = rescore_poses(session, p, scene, alone, others, scores, tables)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
     return _CachedHypotheses(alone, places, scores, by, beside, anew)
 
 
 def _by_neighbours(
-    session: Session, room: Surroundings, so_far: _LocalizationState, image: StationImages
+    session: Session,
+    room: Surroundings,
+    so_far: _LocalizationState,
+    image: StationImages,
+    tables: DistanceTables,
 ) -> Array:
     """Poses (n, 4, 4) of an image by the background of each of its neighbours, at the distance
     from it at which the legs match best.
     """
-    p, scene = image.decoded(), so_far.scene
+    p, scene = image, so_far.scene
     away = [np.linalg.norm(one.T_camera_base[:3, 3]) for one in so_far.placed.values()]
     lines = room.relative(p.station, so_far.placed, _OPTIONS.apart * float(np.median(away)))
-    view = finest_view(scene.machine, p, session.joints, scene.T_base_platform)
+    view = finest_view(scene.machine, p, session.joints, scene.T_base_platform, tables)
     return localize_along(view, lines, legs.LEG_SEARCH_OPTIONS.sigma)
 
 
@@ -572,14 +587,46 @@ def _on_board(
     return {k: PoseHypotheses(T[order], total[order], 1.0) for k, T in own.items()}
 
 
-def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
+def _rival_probabilities(
+    hypotheses: Mapping[int, PoseHypotheses], apart: Collection[int] = ()
+) -> dict[int, float]:
+    """Probability of each image that its first hypothesis is not the correct one.
+
+    The rival is its second hypothesis, or one that the search missed: if the correct pose is not
+    among the hypotheses, the first is the likeliest wrong one, and no likelier than the likeliest
+    wrong ones of the other images usually are, their second hypotheses.
+
+    apart : images whose hypotheses are weighed by other evidence too, a board or a person; they are
+        compared with their own second one only.
+    """
+    rivals = [
+        one.log_likelihood_ratio[1] / one.unit
+        for k, one in hypotheses.items()
+        if k not in apart and len(one.T_camera_base) > 1
+    ]
+    usual = float(np.median(rivals)) if rivals else 0.0
+    out: dict[int, float] = {}
+    for k, one in hypotheses.items():
+        out[k] = one.rival_probability
+        if k not in apart:
+            gain = float(one.log_likelihood_ratio[0] / one.unit) - usual
+            out[k] = max(out[k], 1 / (1 + float(np.exp(min(gain, 500.0)))))
+    return out
+
+
+def _sure(
+    hypotheses: Mapping[int, PoseHypotheses], count: int, apart: Collection[int] = ()
+) -> list[int]:
     """Station numbers of the images whose poses are accepted.
 
     These are the images with the smallest rival probabilities, as long as their sum stays below
     ``HandheldOptions.misplaced``, in proportion to the images scored so far among ``count``.
+
+    apart : as of :func:`_rival_probabilities`.
     """
-    order = sorted(hypotheses, key=lambda k: hypotheses[k].rival_probability)
-    together = np.cumsum([hypotheses[k].rival_probability for k in order])
+    probability = _rival_probabilities(hypotheses, apart)
+    order = sorted(probability, key=lambda k: probability[k])
+    together = np.cumsum([probability[k] for k in order])
     return [
         k
         for k, fault in zip(order, together, strict=True)
@@ -588,17 +635,22 @@ def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
 
 
 def _accepted_poses(
-    hypotheses: Mapping[int, PoseHypotheses], count: int, boards: Boards, prior_poses: Array
+    hypotheses: Mapping[int, PoseHypotheses],
+    count: int,
+    apart: Collection[int],
+    boards: Boards,
+    prior_poses: Array,
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of the accepted images and those connected to them by a board.
 
     NaN for the others.
 
     count : number of hand-held images, some of which may not be scored yet.
+    apart : as of :func:`_rival_probabilities`.
     prior_poses : (S, 4, 4) of the stations localized before.
     """
     out = prior_poses.copy()
-    for k in _sure(hypotheses, count):
+    for k in _sure(hypotheses, count, apart):
         out[k] = hypotheses[k].T_camera_base[0]
     visible = [None if np.isnan(T).any() else T for T in out]
     joined = boards.joined(visible)
@@ -654,11 +706,19 @@ def without_misplaced(
     return _without(case._replace(scene=scene), wrong, dict(enumerate(scene.T_camera_base)))
 
 
-def why_lost(hypotheses: PoseHypotheses) -> str:
-    """Reason, as text, why an image could not be localized."""
+def why_lost(hypotheses: PoseHypotheses, probability: float) -> str:
+    """Reason, as text, why an image could not be localized.
+
+    probability : of a rival, by :func:`_rival_probabilities`.
+    """
+    if probability > hypotheses.rival_probability:
+        return (
+            "its edges fit the legs no better than other images' edges fit from wrong places;"
+            f" the right one was missed with probability {brief(probability)}"
+        )
     return (
         "its edges fit the legs nearly as well from another place, which with probability"
-        f" {brief(hypotheses.rival_probability)} is the right one"
+        f" {brief(probability)} is the right one"
     )
 
 

@@ -15,13 +15,14 @@ in a cluttered image a chance match of a leg matches all of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import PriorScene
@@ -30,6 +31,7 @@ from pkmcal.identify.bundle import Fit, fit_state, marginalize_to_machine
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, of_stations
 from pkmcal.observe import legs
+from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.image_localization import (
     PoseHypotheses,
@@ -74,10 +76,6 @@ class PoseScoringOptions:
 
 _OPTIONS = PoseScoringOptions()
 
-ViewOf = Callable[[int, PriorScene], StationView]
-"""Function that returns the view of a station's single image, given the station's number and a
-scene."""
-
 
 def register_images(
     session: Session,
@@ -94,26 +92,47 @@ def register_images(
     images : by station.
     boards : boards in these images.
     """
-
-    def view(k: int, scene: PriorScene) -> StationView:
-        return finest_view(scene.machine, images[k], session.joints, scene.T_base_platform)
-
     n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
     every = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
     again = len(every) >= _OPTIONS.refined_again_growth * len(scene.edges)
-    near = every | {
-        k: refine_local(view(k, scene), T, _OPTIONS.silhouette_scatter)[0]
-        for k, T in (every if again else places).items()
-    }
+    near, edges = _silhouettes(session, images, scene, every, (every if again else places).keys())
     updated_scene = scene._replace(prior=None)
     while True:
-        last, fit = _measurement_pass(session, updated_scene, near, boards, view)
+        last, fit = _joint_fit(session, updated_scene, near, edges, boards)
         # scatter of the silhouettes from their residuals, relative to the stated sigmas
         updated_scene = last._replace(scatter=updated_scene.scatter * fit.edge_scale)
-        near = {k: updated_scene.T_camera_base[k] for k in near}
         n_passes -= 1
         if not n_passes:
             return updated_scene._replace(prior=marginalize_to_machine(fit.info))
+        near = {k: updated_scene.T_camera_base[k] for k in near}
+        near, edges = _silhouettes(session, images, updated_scene, near, ())
+
+
+def _silhouettes(
+    session: Session,
+    images: Mapping[int, StationImages],
+    scene: PriorScene,
+    places: Mapping[int, Array],
+    refined: Collection[int],
+) -> tuple[dict[int, Array], dict[int, EdgeSet]]:
+    """Poses T_camera_base (4, 4) and silhouettes of images, by station, several images at a time.
+
+    places : poses by station. refined : stations of which the likeliest pose near it is taken.
+    """
+
+    def measure(k: int) -> tuple[Array, EdgeSet]:
+        # the distance tables of an image serve both, and are too large to be retained
+        view = finest_view(scene.machine, images[k], session.joints, scene.T_base_platform)
+        T = places[k]
+        if k in refined:
+            T = refine_local(view, T, _OPTIONS.silhouette_scatter)[0]
+        return T, silhouette_edges(view, T, k).edges.scaled(scene.scatter)
+
+    stations = sorted(places)
+    with ThreadPoolExecutor(THREADS) as pool:
+        measured = list(pool.map(measure, stations))
+    poses = {k: T for k, (T, _) in zip(stations, measured, strict=True)}
+    return poses, {k: edges for k, (_, edges) in zip(stations, measured, strict=True)}
 
 
 def evaluate_pose(
@@ -128,35 +147,28 @@ def evaluate_pose(
 
     view : of this image.
     """
-
-    def changed(_: int, now: PriorScene) -> StationView:
-        return replace(view, machine=now.machine, all_poses=now.T_base_platform)
-
     paid = 0.0
     for _ in range(_OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal):
-        scene, fit = _measurement_pass(session, scene, {station: T_camera_base}, Boards(), changed)
+        view = replace(view, machine=scene.machine, all_poses=scene.T_base_platform)
+        edges = silhouette_edges(view, T_camera_base, station).edges.scaled(scene.scatter)
+        near = {station: T_camera_base}
+        scene, fit = _joint_fit(session, scene, near, {station: edges}, Boards())
         T_camera_base, paid = scene.T_camera_base[station], fit.change
     return scene, paid
 
 
-def _measurement_pass(
+def _joint_fit(
     session: Session,
     scene: PriorScene,
     places: Mapping[int, Array],
+    edges: Mapping[int, EdgeSet],
     boards: Boards,
-    view: ViewOf,
 ) -> tuple[PriorScene, Fit]:
-    """Measure silhouettes from the given poses and estimate the scene.
+    """Estimate the scene from silhouettes, by station, that were measured from the given poses.
 
     Other images enter by the marginal prior of the machine only.
     """
     stations = sorted(places)
-
-    def measure(k: int) -> EdgeSet:
-        return silhouette_edges(view(k, scene), places[k], k).edges.scaled(scene.scatter)
-
-    edges = {k: measure(k) for k in stations}
-    # joint estimate of these stations alone
     only = replace(session.of_stations(stations), trackers=(), links=())
     visible = boards.of(np.array(stations, dtype=int))
     numbered = of_stations({n: edges[k] for n, k in enumerate(stations)})
@@ -167,7 +179,9 @@ def _measurement_pass(
     at = scene.T_camera_base.copy()
     at[stations] = fit.state.T_camera_base
     poses = fit.state.T_base_platform
-    now = scene._replace(machine=fit.machine, T_camera_base=at, T_base_platform=poses, edges=edges)
+    now = scene._replace(
+        machine=fit.machine, T_camera_base=at, T_base_platform=poses, edges=dict(edges)
+    )
     return now, fit
 
 
@@ -197,6 +211,7 @@ def rescore_poses(
     hypotheses: PoseHypotheses,
     others: Array,
     scores: ScoredPoses | None = None,
+    tables: DistanceTables | None = None,
 ) -> tuple[PoseHypotheses, ScoredPoses]:
     """Pose hypotheses of one image, weighted by the present knowledge of the machine, and their
     scores.
@@ -207,10 +222,11 @@ def rescore_poses(
     hypotheses : from localization.
     others : (n, 4, 4) further poses to score.
     scores : earlier ones with the same machine; their poses are not scored again.
+    tables : finest distance tables of the image, computed if None.
     """
     p = image.decoded()
     one = np.zeros(1, dtype=int)
-    view = finest_view(before.machine, p, session.joints, before.T_base_platform)
+    view = finest_view(before.machine, p, session.joints, before.T_base_platform, tables)
     # candidates, refined with the machine as it is known
     near = (
         hypotheses.log_likelihood_ratio
@@ -220,7 +236,10 @@ def rescore_poses(
     # maximum likelihood with the machine unchanged; a changed machine is tried below
     settled, log_likelihood_ratio = refine_ml(view, places, one, 16, 6, _OPTIONS.silhouette_scatter)
     if before.edges:  # the machine changes little: search around the likeliest poses
-        for k in np.argsort(-log_likelihood_ratio, kind="stable")[: _OPTIONS.refined_locally]:
+        # equal poses have the same likelier one near them
+        order = np.argsort(-log_likelihood_ratio, kind="stable")
+        order = order[distinct_silhouettes(view, settled[order], one)]
+        for k in order[: _OPTIONS.refined_locally]:
             settled[k], log_likelihood_ratio[k] = refine_local(
                 view, settled[k], _OPTIONS.silhouette_scatter
             )

@@ -90,21 +90,23 @@ def _check(folder: Path, seed: int, repeat: bool, progress: Progress) -> Session
     if repeat:
         require_repeats(session)
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
-    progress("Reading images" if session.stations else "Reading the measurements", 0.05)
+    # hand-held images take so long that reading them is a small share
+    by_hand = any(station.handheld for station in session.stations)
+    reading, searched = (0.02, 0.95) if by_hand else (0.2, 0.8)
+    progress("Reading images" if session.stations else "Reading the measurements", reading / 4)
     images, broken = _decode_images(session)
-    progress("Localizing the stations", 0.1)
+    progress("Localizing the stations", reading / 2)
     motion = _kinematics(session, np.random.default_rng(seed))
     # Images, readings, links and numbering of the legs.
-    observed = _check_images(session, images, motion.poses, seed, part(progress, 0.2, 0.8))
+    observed = _check_images(session, images, motion.poses, seed, part(progress, reading, searched))
     stations, joints = observed.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *observed.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
     findings += numbering_note(session)
     # Forecast of a full capture.
-    progress("What such images will give", 0.8)
-    by_hand = any(station.handheld for station in session.stations)  # no station for further images
+    progress("What such images will give", searched)
     expected = None
-    if observed.inspection and not by_hand:
+    if observed.inspection and not by_hand:  # no station for further images
         try:
             expected = forecast(observed.inspection)
         except (PkmcalError, np.linalg.LinAlgError) as error:

@@ -110,9 +110,9 @@ class ImageLocalizationOptions:
     near_turn: float = np.radians(5.0)
     # standard deviations of the starts' shift in the camera's axes, relative to its distance
     near_shift: tuple[float, float, float] = (0.005, 0.005, 0.03)
-    # number of camera positions scored together; they take some ten megabytes (numerical: no
-    # effect on results)
-    batch: int = 214
+    # number of camera positions scored together, so that intermediate results stay in the
+    # processor's cache (numerical: no effect on results)
+    batch: int = 64
     # distance tables, of which width and number of directions are changed
     tables: DistanceTableOptions = DISTANCE_TABLE_OPTIONS
     # chart of possible tubes
@@ -299,19 +299,25 @@ def localize_along(
     scatter: float,
     options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
 ) -> Array:
-    """Likeliest pose (N, 4, 4) of each of N lines of poses (N, D, 4, 4), such as a camera's at
-    unknown distance in a given direction.
+    """Likeliest poses (n, 4, 4) on N lines of poses (N, D, 4, 4), such as a camera's at unknown
+    distance in a given direction; equal ones once.
 
     view : with the finest tables. scatter : as of :func:`refine_local`.
     """
     one = np.zeros(1, dtype=int)
-    out = np.zeros((0, 4, 4))
+    if not len(T_camera_base):
+        return np.zeros((0, 4, 4))
+    best: list[Array] = []
+    likelihood: list[float] = []
     for line in T_camera_base:
         starts = _most(view, line, 8, options.on_line)
         starts, log_likelihood_ratio = refine_ml(view, starts, one, 8, 6)
-        best = starts[np.argmax(log_likelihood_ratio)]
-        out = np.concatenate([out, refine_local(view, best, scatter)[0][None]])
-    return out
+        best.append(starts[np.argmax(log_likelihood_ratio)])
+        likelihood.append(float(log_likelihood_ratio.max()))
+    # lines that lead to the same pose: the likeliest of them
+    starts = np.stack(best)[np.argsort(-np.array(likelihood), kind="stable")]
+    starts = starts[distinct_silhouettes(view, starts, one)]
+    return np.stack([refine_local(view, start, scatter)[0] for start in starts])
 
 
 def localize_near(
@@ -429,15 +435,10 @@ def _hypotheses(view: StationView, chart: TubeChart, options: ImageLocalizationO
     for away in distance:
         point = tubes.ends - (tubes.centre + direction * away)[:, None, None]
         in_view = np.einsum("pij,ptnj->ptni", rotation_to, point)
+        charted = _charted_tubes(in_view, tubes.radius, chart)
         for turn in range(options.candidates.turns):
-            score = _scores(
-                in_view,
-                tubes.radius,
-                2 * np.pi * turn / options.candidates.turns,
-                chart,
-                windows,
-                options,
-            )
+            angle = 2 * np.pi * turn / options.candidates.turns
+            score = _scores(charted, angle, chart, windows, options)
             for _ in range(options.positions):
                 best = score.argmax(axis=-1)[:, None]
                 shifts += [best]
@@ -508,9 +509,43 @@ def _border(surprisal: Integers) -> int:
     return max(surprisal.shape[2:])
 
 
+class _ChartedTubes(NamedTuple):
+    """T tubes on the chart from P positions, before the rotation about the optical axis.
+
+    middle : (P, T, 2) fine cells from the middle of the chart.
+    normal : (P, T) direction of the tubes' normals, rad.
+    width_number : (P, T) indices of the tabulated widths.
+    weight : (P, T) share of each tube in the length of all.
+    """
+
+    middle: Array
+    normal: Array
+    width_number: Integers
+    weight: Array
+
+
+def _charted_tubes(points: Array, radius: Array, chart: TubeChart) -> _ChartedTubes:
+    """Tubes on the chart.
+
+    points : (P, T, 3, 3) first, middle and last points of the tubes in the camera frames of P
+        positions.
+    radius : (T,) m.
+    """
+    # chart coordinates of the points: angle from the optical axis
+    beside = np.hypot(points[..., 0], points[..., 1])
+    angle = np.arctan2(beside, points[..., 2])
+    cell = points[..., :2] * (chart.scale * angle / np.maximum(beside, 1e-12))[..., None]
+    # direction, apparent width and weight of each tube
+    chord = cell[:, :, 2] - cell[:, :, 0]
+    normal = np.arctan2(chord[..., 0], -chord[..., 1])
+    width = 2 * radius * chart.scale / np.sqrt(dot(points[:, :, 1], points[:, :, 1]))
+    weight = np.hypot(chord[..., 0], chord[..., 1])
+    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    return _ChartedTubes(cell[:, :, 1], normal, chart.width_number(width), weight)
+
+
 def _scores(
-    points: Array,
-    radius: Array,
+    tubes: _ChartedTubes,
     turn: float,
     chart: TubeChart,
     windows: Integers,
@@ -519,39 +554,25 @@ def _scores(
     """Mean map value (P, shifts) at the middles of the tubes, weighted by their length in the
     image.
 
-    points : (P, T, 3, 3) first, middle and last points of the tubes in the camera frames of P
-        positions.
-    radius : (T,) m.
     turn : rotation about the optical axis, rad.
     windows : as :func:`_windows` returns them.
     """
-    # chart coordinates of the points: angle from the optical axis, rotated by the turn
-    beside = np.hypot(points[..., 0], points[..., 1])
-    angle = np.arctan2(beside, points[..., 2])
-    cell = points[..., :2] * (chart.scale * angle / np.maximum(beside, 1e-12))[..., None]
-    cell = cell @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    # direction, apparent width and weight of each tube
-    chord = cell[:, :, 2] - cell[:, :, 0]
-    normal = np.arctan2(chord[..., 0], -chord[..., 1])
     number = (
-        np.rint(normal % np.pi * (chart.options.directions / np.pi)).astype(np.intp)
+        np.rint((tubes.normal + turn) % np.pi * (chart.options.directions / np.pi)).astype(np.intp)
         % chart.options.directions
     )
-    width = 2 * radius * chart.scale / np.sqrt(dot(points[:, :, 1], points[:, :, 1]))
-    weight = np.hypot(chord[..., 0], chord[..., 1])
-    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
     # first cell of each tube's window of shifts
-    at = np.floor((cell[:, :, 1] + chart.middle) / chart.options.map_cell).astype(np.intp)
+    middle = tubes.middle @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    at = np.floor((middle + chart.middle) / chart.options.map_cell).astype(np.intp)
     shifts = windows.shape[-2:]
     first = _border(chart.surprisal) - options.stride * (np.array(shifts[::-1]) // 2)
     at = np.clip(at + first, 0, np.array(windows.shape[3:1:-1]) - 1)
-    which = chart.width_number(width)
-    out = np.empty((len(points), shifts[0] * shifts[1]), dtype=np.float32)
-    for k in range(0, len(points), options.batch):
+    out = np.empty((len(at), shifts[0] * shifts[1]), dtype=np.float32)
+    for k in range(0, len(at), options.batch):
         part = slice(k, k + options.batch)
-        worth = windows[which[part], number[part], at[part, :, 1], at[part, :, 0]]
+        worth = windows[tubes.width_number[part], number[part], at[part, :, 1], at[part, :, 0]]
         worth = worth.reshape(*worth.shape[:2], -1).astype(np.float32)
-        out[part] = np.matmul(weight[part, None], worth)[:, 0]
+        out[part] = np.matmul(tubes.weight[part, None], worth)[:, 0]
     return out
 
 

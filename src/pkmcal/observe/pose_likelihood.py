@@ -533,22 +533,28 @@ def coinciding_edges(view: StationView, candidates: Array, images: Integers, sam
     (:func:`~pkmcal.observe.image_localization.weighed_poses`), loses evidence of stations: a
     mirrored hexapod is then taken for one numbered backwards.
     """
-    parts = _parts(view, len(candidates), len(images) * samples * 2 * len(view.tubes))
+    parts = _parts(view, len(candidates), len(images) * samples * 4)
     if len(parts) > 1:
         return np.concatenate(
             [coinciding_edges(view.guess(k), candidates[k], images, samples) for k in parts]
         )
     points, _, _ = _edges_under(view, candidates, images, samples)
-    pixel, outward = points.pixel[..., None, :], points.outward[..., None, :]  # (H, K, E, n, 1, 2)
-    begin, middle = points.pixel[..., 0, :], points.outward[..., points.outward.shape[-2] // 2, :]
+    # each condition is linear in a point, or in its outward normal: (H, K, E n, 2) times (2, E)
+    begin, normal = points.pixel[..., 0, :], points.outward[..., points.outward.shape[-2] // 2, :]
     chord = points.pixel[..., -1, :] - begin
-    begin, chord, normal = (v[..., None, None, :, :] for v in (begin, chord, middle))
-    along = dot(pixel - begin, chord) / np.maximum(dot(chord, chord), 1e-9)
-    across = np.abs(dot(pixel - begin, normal))
-    beside = (along >= 0) & (along <= 1) & (across < view.options.apart * view.tables.scale)
-    coincides = beside & (dot(outward, normal) > np.cos(view.options.same_direction))
-    count = np.maximum(coincides.sum(axis=-1), 1)
-    return count.reshape(len(candidates), -1, samples).astype(np.float32)
+    flat = (*begin.shape[:-2], -1, 2)
+    pixel, outward = points.pixel.reshape(flat), points.outward.reshape(flat)
+    own = np.arange(pixel.shape[-2]) // samples, np.arange(pixel.shape[-2])
+    with np.errstate(invalid="ignore", over="ignore"):  # edges beside the camera have no image
+        chord = chord / np.maximum(dot(chord, chord), 1e-9)[..., None]
+        along = pixel @ chord.mT - dot(begin, chord)[..., None, :]
+        across = np.abs(pixel @ normal.mT - dot(begin, normal)[..., None, :])
+        coincides = (outward @ normal.mT > np.cos(view.options.same_direction)) & (
+            across < view.options.apart * view.tables.scale
+        )
+        coincides &= (along >= 0) & (along <= 1)
+    coincides[..., own[1], own[0]] = True
+    return coincides.sum(axis=-1).reshape(len(candidates), -1, samples).astype(np.float32)
 
 
 def linearize_distances(
@@ -598,7 +604,11 @@ def _distances(
     shape = (len(values), -1, values.shape[-1])
     inside = np.broadcast_to(inside, values.shape)
     chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
-    length = np.hypot(chord[..., 0], chord[..., 1])
+    # at most the image's diagonal: of an edge that passes close to the camera a single point may
+    # lie in the image, and would count as thousands of pixels of silhouette; NaN if an end of the
+    # edge has no image
+    diagonal = np.float32(np.hypot(*view.camera.image_size))
+    length = np.fmin(np.hypot(chord[..., 0], chord[..., 1]), diagonal)
     length /= np.float32(view.tables.scale * (shape[-1] - 1))
     return Distances(
         np.where(inside, values, DISTANCE_OUTSIDE_IMAGE).reshape(shape),
