@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,7 +18,7 @@ from document_keys import assert_keys
 from page_documents import page_blocks, page_document
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.errors import InputError
-from pkmcal.files import read_csv
+from pkmcal.files import csv_text, read_csv
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.covariance import machine_covariance
@@ -35,8 +36,10 @@ from pkmcal.planning.plan import PLAN, plan_measurements
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
 from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import of_machine, subject_of_session
-from pkmcal.session.load import load_session
-from pkmcal.simulation import board_for
+from pkmcal.session.load import load_session, load_session_to_plan
+from pkmcal.simulation import Settings, board_for, draw_truth
+from pkmcal.simulation.rehearsal import rehearsal_of
+from pkmcal.simulation.truth import RequestedConfigurations
 
 SIZE = (640, 480)
 
@@ -363,6 +366,46 @@ def test_a_session_before_any_image(demo, quick_plans, tmp_path):
     assert (session / "plan" / "stations.yaml").is_file()
     # and calibrate still needs images
     assert run("calibrate", str(session)).code == 2
+
+
+def test_a_plan_in_the_units_and_steps_of_the_readings(demo, quick_plans, tmp_path):
+    session = tmp_path / "session"
+    shutil.copytree(demo.session, session, ignore=shutil.ignore_patterns("images", "truth.json"))
+    document = yaml.safe_load((session / "session.yaml").read_text())
+    document["joints"]["noise"] = 7e-6
+    (session / "session.yaml").write_text(yaml.safe_dump(document))
+    table = read_csv(session / "joints.csv")
+    hundredths = np.round(1e5 * table.values) / 100
+    (session / "joints.csv").write_text(
+        csv_text([f"{name} [mm]" for name in table.columns], table.names, hundredths)
+    )
+    assert run("plan", str(session), "-n", "3").code == 0
+    text = (session / "plan" / "plan.csv").read_text()
+    assert text.startswith("configuration,leg1 [mm],leg2 [mm],leg3 [mm]")
+    planned = read_csv(session / "plan" / "plan.csv")
+    steps = 1e5 * planned.values
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    # its rehearsal has its names, its noise and its configurations
+    rehearsal = rehearsal_of(session / "plan")
+    loaded = load_session_to_plan(session)
+    assert rehearsal.requested.names == planned.names
+    assert rehearsal.requested.stations == loaded.station_names
+    assert (rehearsal.joint_noise, rehearsal.observe) == (7e-6, ("legs",))
+    np.testing.assert_allclose(rehearsal.requested.joints, planned.values, atol=1e-9)
+
+
+def test_a_rehearsal_leaves_out_what_the_true_machine_cannot_take():
+    machine = load_mechanism("gough-stewart")
+    cameras = (camera_of_size(SIZE),)
+    truth = draw_truth(machine, cameras, Settings(stations=1, configurations=4), 0)
+    joints = np.concatenate([truth.joints[:1], [[9.0] + [0.5] * 5], truth.joints[1:]])
+    pairs = np.stack([np.zeros(5, dtype=int), np.arange(5)], axis=-1)
+    asked = RequestedConfigurations(tuple("abcde"), joints, ("front",), pairs)
+    drawn = draw_truth(machine, cameras, Settings(stations=1, asked=asked), 0)
+    assert (drawn.stations, drawn.configurations) == (("front",), tuple("acde"))
+    assert drawn.unreachable == ("b",)
+    assert drawn.images.tolist() == [[0, 0], [0, 1], [0, 2], [0, 3]]
+    assert len(drawn.readings) == len(drawn.T_base_platform) == 4
 
 
 def test_a_session_without_places(demo, quick_plans, tmp_path):

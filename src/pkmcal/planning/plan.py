@@ -327,7 +327,7 @@ def _routed_plan(
         subject=subject,
         stations=tuple(tuple(subject.rig.names[s] for s in groups[chosen.group[k]]) for k in order),
         names=_new_names(chosen.group[order], subject.names),
-        joints=chosen.joints[order],
+        joints=subject.commanded(chosen.joints[order]),
         T_base_platform=chosen.T_base_platform[order],
         rank=rank[order],
         now=_accuracy(own, own.covariance(own.information), 0),

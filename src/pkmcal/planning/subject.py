@@ -26,8 +26,10 @@ from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.saved_calibration import CalibrationPrior, SavedCalibration, load
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
+from pkmcal.files import Unit
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.start import start_mounts
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements import SHADING_SIGMA, Mount
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import first_binning
@@ -49,6 +51,7 @@ from pkmcal.planning.rig import (
     nominal_pools,
 )
 from pkmcal.session.load import Session
+from pkmcal.session.readings import rounding_step
 from pkmcal.simulation.board import place_board
 from pkmcal.wording import brief, listed
 
@@ -57,6 +60,8 @@ PLAN_IMAGES_A_STATION = 12
 together. A plan is made once, and few edges determine the shading badly.
 """
 BOARD_MOUNT_NAME = "board"
+FINEST_STEP = 1e-6
+"""m or rad, step of a reading below which no drive moves."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,8 @@ class Subject:
 
     rig : machine and instruments.
     prior : prior of an earlier calibration.
-    columns : columns of joints.csv.
+    columns : columns of joints.csv. units : their units, None for SI; empty without any.
+    steps : (m,) of which all existing readings of a motor are multiples, m or rad, 0 for none.
     names : of existing configurations.
     words : sentences on the sources of its numbers.
     board : fields of the board's file, if a board is observed.
@@ -77,8 +83,17 @@ class Subject:
     names: tuple[str, ...]
     words: tuple[str, ...]
     board: dict[str, Any] | None = None
+    units: tuple[Unit | None, ...] = ()
+    steps: Array | None = None
 
     __repr__ = short_repr
+
+    def commanded(self, joints: Array) -> Array:
+        """Readings (n, m) as the machine's controller takes them: multiples of the steps."""
+        if self.steps is None:
+            return joints
+        step = np.where(self.steps > 0, self.steps, 1.0)
+        return np.where(self.steps > 0, np.round(joints / step) * step, joints)
 
 
 def as_it_stands(
@@ -276,7 +291,24 @@ def subject_of_session(
     columns = tuple(session.document["joints"]["columns"])
     names = session.configurations
     fields = board.document if board else None
-    return Subject(rig, prior, columns, names, (*words, *corner_source), fields)
+    return Subject(
+        rig, prior, columns, names, (*words, *corner_source), fields, session.reading_units,
+        _steps(session),
+    )  # fmt: skip
+
+
+def _steps(session: Session) -> Array:
+    """Steps (m,) of a session's readings; 0 where they have none, or only few coarse values, whose
+    step is more than a negligible share of the motor's range.
+    """
+    spans = np.ptp(session.machine.joint_ranges, axis=1)
+    steps = np.zeros(len(spans))
+    for m, (unit, span) in enumerate(zip(session.machine.joint_units, spans, strict=True)):
+        readings = session.joints[:, m]
+        step = rounding_step(readings, unit, FINEST_STEP) if readings.any() else None
+        if step is not None and step <= NEGLIGIBLE * span:
+            steps[m] = step
+    return steps
 
 
 def _rig(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -39,11 +40,7 @@ PLAN_METHOD_TEXT = (
 
 def outcome_of(plan: MeasurementPlan) -> Outcome:
     """Outcome of ``pkmcal plan``."""
-    texts: dict[str, str | bytes] = {
-        PLAN_TABLE_FILE: csv_text(
-            plan.subject.columns, plan.names, plan.joints.round(PLAN_READING_DECIMALS)
-        )
-    }
+    texts: dict[str, str | bytes] = {PLAN_TABLE_FILE: _table_text(plan)}
     parts = [_curve(plan)]
     if plan.tried:
         texts[PLAN_STATIONS_FILE] = yaml_text(stations_document(plan))
@@ -102,6 +99,22 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     )
 
 
+def _table_text(plan: MeasurementPlan) -> str:
+    """Readings in the columns and units of joints.csv."""
+    subject = plan.subject
+    units = subject.units or (None,) * len(subject.columns)
+    heads = [
+        name if unit is None else f"{name} [{unit.name}]"
+        for name, unit in zip(subject.columns, units, strict=True)
+    ]
+    values = plan.joints.copy()
+    for m, unit in enumerate(units):
+        factor = 1.0 if unit is None else unit.factor
+        decimals = PLAN_READING_DECIMALS + math.ceil(math.log10(factor))
+        values[:, m] = np.round(values[:, m] / factor, decimals)
+    return csv_text(heads, plan.names, values)
+
+
 def _accuracy_text(accuracy: Accuracy) -> str:
     """Accuracy of position and, if the platform turns, of orientation, in words."""
     words = f"position to {amount(accuracy.position, 'm')}"
@@ -158,8 +171,8 @@ def _order(plan: MeasurementPlan) -> Part:
         ("Configuration", "from", "rank", *columns),
         tuple(rows),
         f"The way from home is the shortest that was found. Rank: if fewer are wanted, those up to"
-        f" a rank are the best so many from each place. {PLAN_TABLE_FILE} holds the readings in"
-        " metres and radians; measured readings replace them.",
+        f" a rank are the best so many from each place. {PLAN_TABLE_FILE} holds the readings in the"
+        " units of joints.csv; measured readings replace them.",
         brief=False,
         words=(1,),
     )
@@ -229,13 +242,9 @@ def _camera_poses(plan: MeasurementPlan) -> Part:
 
 def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
     """Chosen places as entries of session.yaml."""
-    rig, out = plan.subject.rig, dict[str, Any]()
+    out = dict[str, Any]()
     for name, _, T_camera_base in _cameras(plan):
-        observe = [
-            word
-            for word, kind in (("legs", LegsFrom), ("board", BoardFrom))
-            if any(isinstance(x, kind) and rig.names[x.station] == name for x in rig.instruments)
-        ]
+        observe = _observed(plan, name)
         out[name] = {
             "camera": "cameras/camera.yaml",
             "images": f"images/{name}/{{configuration}}.png",
@@ -243,6 +252,14 @@ def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
             "pose": StationPose.of(T_camera_base).rounded(3),
         }
     return {"stations": out}
+
+
+def _observed(plan: MeasurementPlan, name: str) -> list[str]:
+    """What a station observes, as in session.yaml."""
+    rig = plan.subject.rig
+    own = [one for one in rig.instruments if rig.names[one.station] == name]
+    kinds = (("legs", LegsFrom), ("board", BoardFrom))
+    return [word for word, kind in kinds if any(isinstance(one, kind) for one in own)]
 
 
 def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
@@ -267,6 +284,7 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
             "pays_until": plan.pays_until,
             "curve": [_accuracy_document(a) for a in plan.curve],
             "columns": list(plan.subject.columns),
+            "joint_noise": rig.joint_noise,
             "configurations": [
                 {
                     "name": name,
@@ -279,7 +297,10 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
                 for name, stations, rank, joints, T, blocked in joined
             ],
             "stations": [
-                {"name": name, "T_base_camera": inverse(T), "camera": camera.document()}
+                {
+                    "name": name, "T_base_camera": inverse(T), "camera": camera.document(),
+                    "observe": _observed(plan, name),
+                }
                 for name, camera, T in _cameras(plan)
             ],
             "places_tried": [

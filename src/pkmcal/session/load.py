@@ -29,6 +29,7 @@ from pkmcal.files import (
     CsvTable,
     Document,
     Keys,
+    Unit,
     any_unit,
     check_count,
     check_regular,
@@ -147,6 +148,7 @@ class Session:
     temperature : (K,) °C, of the configurations; None where joints.csv has none.
     earlier_joints : (E, m) readings of the same machine at other poses; None for none. The
         localization of few images is tested against them as well.
+    reading_units : units in the heads of joints.csv's m columns, None for SI; empty without any.
     """
 
     folder: Path
@@ -167,6 +169,7 @@ class Session:
     links: tuple[LinkSet, ...] = ()
     temperature: Array | None = None
     earlier_joints: Array | None = None
+    reading_units: tuple[Unit | None, ...] = ()
 
     def __repr__(self) -> str:
         parts = (
@@ -359,6 +362,7 @@ def load_session(
         mechanism=source,
         workspace=_workspace(document, schema),
         links=links,
+        reading_units=table.units if any(table.units) else (),
     )
 
 

@@ -78,9 +78,9 @@ class Discs:
     base_radius, platform_radius : m.
     side : +1 where the platform stands above the base along the frames' z, -1 below.
     platform_side : the same for the platform's plate relative to its joints.
-    board_foot, board_side : (3,) point beyond which the platform carries a board, platform frame, and
-        the board's side of it: behind the plate, but before the joints of a planar machine, which
-        cameras see from there.
+    board_foot : (3,) point beyond which the platform carries a board; platform frame.
+    board_side : the board's side of it: behind the plate, but before the joints of a planar
+        machine, where its cameras are.
     thickness : m.
     """
 
