@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -35,7 +36,7 @@ from pkmcal.planning.information import CandidateRows, Candidates, information_o
 from pkmcal.planning.plan import PLAN, plan_measurements
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
 from pkmcal.planning.route import length, motor_distances, shortest_path
-from pkmcal.planning.subject import of_machine, subject_of_session
+from pkmcal.planning.subject import of_machine
 from pkmcal.session.load import load_session, load_session_to_plan
 from pkmcal.simulation import Settings, board_for, draw_truth
 from pkmcal.simulation.rehearsal import rehearsal_of
@@ -454,11 +455,55 @@ def test_a_camera_that_sees_nothing():
         small(replace(subject, rig=rig))
 
 
-def test_a_hand_held_session_is_not_planned(demo):
-    session = load_session(demo.session)
-    stations = tuple(replace(s, handheld=True) for s in session.stations)
-    with pytest.raises(InputError, match="no fixed pose to plan for"):
-        subject_of_session(replace(session, stations=stations))
+def test_two_images_of_each_configuration_by_hand():
+    """Each image has its own place; the plan is better than chance, and is what it promises."""
+    subject = replace(hexapod(1), handheld=True)
+    plan = small(subject)
+    assert len(plan.names) == 5
+    assert plan.stations == tuple((f"{name}-1", f"{name}-2") for name in plan.names)
+    rig = plan.subject.rig
+    assert rig.names == tuple(image for images in plan.stations for image in images)
+    assert plan.promised.position < plan.by_chance.position < plan.now.position
+    # all images together in one problem, each with a place of its own
+    number = {name: s for s, name in enumerate(rig.names)}
+    pairs = [(number[image], k) for k, images in enumerate(plan.stations) for image in images]
+    edges = rig.measured(plan.joints, plan.T_base_platform, np.array(pairs))
+    assembled, state = rig.assembled(edges, plan.T_base_platform)
+    info = assembled.problem.linearize(state)
+    assert len(edges.edges) > 5 * 12
+    assert np.unique(edges.edges.station).size == 10
+    assert info is not None
+
+
+def test_a_hand_held_session_is_planned_and_rehearsed(demo, quick_plans, tmp_path):
+    session = tmp_path / "session"
+    shutil.copytree(demo.session, session, ignore=shutil.ignore_patterns("images", "truth.json"))
+    document = yaml.safe_load((session / "session.yaml").read_text())
+    (camera,) = {station["camera"] for station in document["stations"].values()}
+    document["stations"] = {
+        "phone": {
+            "camera": camera, "images": "images/{configuration}-{repeat}.jpg", "observe": "legs",
+            "handheld": True,
+        }
+    }  # fmt: skip
+    (session / "session.yaml").write_text(yaml.safe_dump(document))
+    name = load_session_to_plan(session).configurations[0]
+    (session / "images").mkdir()
+    for repeat in (1, 2):
+        cv2.imwrite(
+            str(session / "images" / f"{name}-{repeat}.jpg"), np.zeros((480, 640), np.uint8)
+        )
+    result = run("plan", str(session), "-n", "3", "--json")
+    assert result.code == 0, result.out + result.err
+    assert result.json["handheld"]
+    assert [one["stations"] for one in result.json["configurations"]] == [
+        [f"{one['name']}-1", f"{one['name']}-2"] for one in result.json["configurations"]
+    ]
+    rehearsal = rehearsal_of(session / "plan")
+    settings = Settings(stations=rehearsal.places, asked=rehearsal.requested, handheld=True)
+    truth = draw_truth(rehearsal.machine, rehearsal.cameras, settings, 0)
+    assert truth.stations == tuple(f"phone-{image}" for image in rehearsal.requested.stations)
+    assert len(truth.focal_scale) == 6
 
 
 @pytest.mark.slow

@@ -200,7 +200,9 @@ def _camera(camera: Camera | Path | str | tuple[int, int] | None) -> Camera:
 
 def _rehearsed(settings: Settings, planned: Rehearsal) -> Settings:
     """Settings with the stations, the configurations and the board of a plan."""
-    settings = replace(settings, stations=planned.places, asked=planned.requested)
+    settings = replace(
+        settings, stations=planned.places, asked=planned.requested, handheld=planned.handheld
+    )
     if planned.board is None:
         return settings
     return replace(settings, board=planned.board, board_on="platform", observe=planned.observe)

@@ -277,6 +277,17 @@ def _pools(
     return tuple(out)
 
 
+def joined_pools(pools: Sequence[Pools]) -> Pools:
+    """Pools of several stations' edges as one station's, such as of hand-held images."""
+    out: list[EdgePool] = []
+    for own in zip(*pools, strict=True):
+        there = [pool for pool in own if len(pool.information)]
+        parts = (np.concatenate([getattr(p, name) for p in there or own])
+                 for name in ("information", "weight", "length"))  # fmt: skip
+        out.append(EdgePool(*parts, float(np.mean([pool.shading for pool in own]))))
+    return tuple(out)
+
+
 def drawn_edges(
     machine: Machine, edges: EdgeSet, pools: Sequence[Pools], rng: np.random.Generator | None
 ) -> EdgeSet:

@@ -41,7 +41,7 @@ from pkmcal.planning.defaults import (
     NOMINAL_EDGE_SIGMA,
     UNTOLD_READING_NOISE,
 )
-from pkmcal.planning.first import Pools, first_edges, spread_over
+from pkmcal.planning.first import Pools, first_edges, joined_pools, spread_over
 from pkmcal.planning.rig import (
     BoardFrom,
     Instrument,
@@ -50,10 +50,10 @@ from pkmcal.planning.rig import (
     TargetFrom,
     nominal_pools,
 )
-from pkmcal.session.load import Session
+from pkmcal.session.load import Session, Station
 from pkmcal.session.readings import rounding_step
 from pkmcal.simulation.board import place_board
-from pkmcal.wording import brief, listed
+from pkmcal.wording import brief
 
 PLAN_IMAGES_A_STATION = 12
 """Maximum number of a station's images whose edges are measured; twice as many of all stations
@@ -72,6 +72,7 @@ class Subject:
     prior : prior of an earlier calibration.
     columns : columns of joints.csv. units : their units, None for SI; empty without any.
     steps : (m,) of which all existing readings of a motor are multiples, m or rad, 0 for none.
+    handheld : whether its camera is held by hand; the rig's station stands for all its images.
     names : of existing configurations.
     words : sentences on the sources of its numbers.
     board : fields of the board's file, if a board is observed.
@@ -85,6 +86,7 @@ class Subject:
     board: dict[str, Any] | None = None
     units: tuple[Unit | None, ...] = ()
     steps: Array | None = None
+    handheld: bool = False
 
     __repr__ = short_repr
 
@@ -263,18 +265,14 @@ def subject_of_session(
     anywhere : whether poses of its first camera are to be chosen, so that none must be given.
     edge, corner : px, standard deviations for a session without images.
 
-    Raises InputError if the pose of a station is not known, or for hand-held cameras.
+    A session with a hand-held camera is planned for that camera alone. Raises InputError if the
+    pose of a station is not known.
     """
+    by_hand = [station for station in session.stations if station.handheld]
+    if by_hand and not anywhere:
+        return _handheld_subject(session, by_hand, saved, edge, corner, seed)
     if anywhere:
         session = _first_camera_session(session)
-    by_hand = [station.name for station in session.stations if station.handheld]
-    if by_hand:
-        raise InputError(
-            "a hand-held camera has no fixed pose to plan for",
-            where="session.yaml, stations",
-            found=listed(by_hand, 3),
-            next_step="Plan the places of a camera on a tripod: --places 3",
-        )
     words: list[str] = []
     if saved is not None:
         session = replace(session, machine=saved.machine)
@@ -295,6 +293,42 @@ def subject_of_session(
         rig, prior, columns, names, (*words, *corner_source), fields, session.reading_units,
         _steps(session),
     )  # fmt: skip
+
+
+def _handheld_subject(
+    session: Session,
+    by_hand: Sequence[Station],
+    saved: SavedCalibration | None,
+    edge: float,
+    corner: float,
+    seed: int,
+) -> Subject:
+    """Subject with a session's hand-held camera.
+
+    by_hand : its images. Edges are as good as in those that the calibration has localized.
+    """
+    first = replace(by_hand[0], name=by_hand[0].entry)
+    rest = replace(session, stations=(first,), trackers=(), links=())
+    planned = subject_of_session(rest, saved, anywhere=True, edge=edge, corner=corner, seed=seed)
+    placed = [] if saved is None else [one for one in by_hand if one.name in saved.placed]
+    planned = replace(planned, handheld=True)
+    if saved is None or not placed or "legs" not in first.observe:
+        return planned
+    known = [placed[k] for k in spread_over(np.arange(len(placed)))]
+    seen = replace(session, machine=saved.machine, stations=tuple(known), trackers=(), links=())
+    images, T_camera_base = read_images(seen), _saved_station_poses(seen, saved)
+    rows = [np.zeros(1, dtype=int)] * len(images)
+    measured = first_edges(seen, images, rows, T_camera_base, platform_poses(seen))
+    pools = joined_pools(measured.pools)
+    rig = planned.rig
+    instruments = tuple(
+        replace(one, pools=pools, binning=images[0].binning) if isinstance(one, LegsFrom) else one
+        for one in rig.instruments
+    )
+    shading = measured.estimate.statistics.shading
+    words = f"The accuracy of edges is measured in {len(known)} images that the calibration has."
+    rig = replace(rig, instruments=instruments, shading=shading)
+    return replace(planned, rig=rig, words=(planned.words[0], words))
 
 
 def _steps(session: Session) -> Array:

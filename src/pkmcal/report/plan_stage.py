@@ -30,7 +30,7 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
     """
     machine = plan.subject.rig.machine
     postures = Postures(plan.joints, plan.T_base_platform)
-    points = list(_by_station(plan))
+    points = _by_station(plan)
     if plan.tried:
         points.append(_candidates(plan.tried))
     block = Space(
@@ -53,18 +53,20 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
 
 def _by_station(plan: MeasurementPlan) -> list[SpacePoints]:
     """Platform positions, one set for each group of stations that measure together."""
-    groups = list(dict.fromkeys(plan.stations))
+    where = [f"From {listed(names, 3)}" for names in plan.stations]
+    if plan.subject.handheld:  # each has its own
+        where = ["In two images each"] * len(where)
     out: list[SpacePoints] = []
-    for n, group in enumerate(groups):
-        rows = [k for k, own in enumerate(plan.stations) if own == group]
+    for n, words in enumerate(dict.fromkeys(where)):
+        rows = [k for k, own in enumerate(where) if own == words]
         names = [plan.names[k] for k in rows]
         out.append(
             space_points(
-                f"From {listed(group, 3)}",
+                words,
                 STATION_COLOURS[n % len(STATION_COLOURS)],
                 plan.T_base_platform[rows, :3, 3],
                 [configuration_key(name) for name in names],
-                [f"{name} (from {listed(group, 3)})" for name in names],
+                [f"{name} ({words[0].lower()}{words[1:]})" for name in names],
             )
         )
     return out

@@ -50,12 +50,14 @@ class _Plan(_Part):
     stations: tuple[_Station, ...] = Field(min_length=1, description="the plan's cameras")
     board: dict[str, Any] | None = None
     joint_noise: float
+    handheld: bool
 
 
 class Rehearsal(NamedTuple):
     """Planned machine, cameras and their poses, configurations, and the board, if any.
 
     observe : what the cameras observe. joint_noise : standard deviation of a reading, m or rad.
+    handheld : whether each image is from a place of its own.
     """
 
     machine: Machine
@@ -65,6 +67,7 @@ class Rehearsal(NamedTuple):
     board: Board | None
     observe: tuple[str, ...]
     joint_noise: float
+    handheld: bool
 
 
 def rehearsal_of(plan: Path | str) -> Rehearsal:
@@ -110,6 +113,7 @@ def rehearsal_of(plan: Path | str) -> Rehearsal:
         None if results.board is None else board_from_document(_inside(document, results.board)),
         tuple(dict.fromkeys(word for station in results.stations for word in station.observe)),
         results.joint_noise,
+        results.handheld,
     )
 
 

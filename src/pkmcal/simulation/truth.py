@@ -89,7 +89,7 @@ class Settings:
     asked : requested configurations, instead of random ones.
     handheld : whether each image has a pose of its own around the machine, with ``repeats`` images
         of each configuration and focal lengths with the relative standard deviation ``breathing``;
-        ``stations`` is then ignored.
+        a number of ``stations`` is then ignored.
     warming : K, increase of the machine's temperature over the session. The readings contain the
         growth of drives and frame, the images show the machine as it is at first.
     """
@@ -119,9 +119,9 @@ class Settings:
     @property
     def n_stations(self) -> int:
         """Number of stations; of images if the camera is hand-held."""
-        if self.handheld:
-            return self.configurations * self.repeats
-        return self.stations if isinstance(self.stations, int) else len(self.stations)
+        if not isinstance(self.stations, int):
+            return len(self.stations)
+        return self.configurations * self.repeats if self.handheld else self.stations
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ def draw_truth(
     rngs = {name: np.random.default_rng(stream(seed, name)) for name in RANDOM_STREAMS}
     machine = true_machine(nominal, settings.tolerance, rngs["machine"])
     poses = settings.stations
-    if settings.handheld:
+    if isinstance(poses, int) and settings.handheld:
         poses = rough_poses(nominal, cameras, rngs["stations"])
     elif isinstance(poses, int):
         in_view = settings.board_on if settings.board is not None else None
@@ -254,8 +254,11 @@ def draw_truth(
         T_base_platform, joints, images = _configurations(
             nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
         )
-        configurations = tuple(f"{k:04d}" for k in range(len(joints)))
-        names, unreachable = tuple(f"station{k + 1}" for k in range(len(poses))), ()
+        configurations, unreachable = tuple(f"{k:04d}" for k in range(len(joints))), ()
+        names = tuple(f"station{k + 1}" for k in range(len(poses)))
+        if settings.handheld:
+            each = enumerate(configurations[k] for k in images[:, 1])
+            names = tuple(f"{name}-{s % settings.repeats + 1}" for s, name in each)
     else:
         taken, T_base_platform, joints, images = _at_requested(nominal, machine, asked)
         configurations = tuple(compress(asked.names, taken))
@@ -263,22 +266,13 @@ def draw_truth(
     board = None
     if settings.board is not None:
         board = place_board(
-            machine,
-            settings.board,
-            settings.board_on,
-            cameras,
-            T_camera_base,
-            T_base_platform,
-            joints,
-            rngs["board"],
-        )
+            machine, settings.board, settings.board_on, cameras, T_camera_base, T_base_platform,
+            joints, rngs["board"],
+        )  # fmt: skip
     noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
     effects = TrueEffects.draw(nominal, settings.warming, len(joints), rngs["effects"])
     if settings.handheld:
-        names = tuple(
-            f"{HANDHELD_STATION_NAME}-{configurations[k]}-{s % settings.repeats + 1}"
-            for s, k in enumerate(images[:, 1].tolist())
-        )
+        names = tuple(f"{HANDHELD_STATION_NAME}-{name}" for name in names)
     return Truth(
         machine=machine,
         stations=names,
