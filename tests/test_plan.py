@@ -7,7 +7,6 @@ import json
 import shutil
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import yaml
@@ -487,12 +486,6 @@ def test_a_hand_held_session_is_planned_and_rehearsed(demo, quick_plans, tmp_pat
         }
     }  # fmt: skip
     (session / "session.yaml").write_text(yaml.safe_dump(document))
-    name = load_session_to_plan(session).configurations[0]
-    (session / "images").mkdir()
-    for repeat in (1, 2):
-        cv2.imwrite(
-            str(session / "images" / f"{name}-{repeat}.jpg"), np.zeros((480, 640), np.uint8)
-        )
     result = run("plan", str(session), "-n", "3", "--json")
     assert result.code == 0, result.out + result.err
     assert result.json["handheld"]

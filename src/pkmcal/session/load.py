@@ -657,7 +657,7 @@ def _stations(
         name, camera, camera_file, T_camera_base, images, station.observe, name,
         station.handheld, from_exif, station.response or usual, station.response is not None,
     )  # fmt: skip
-    if not station.handheld:
+    if not station.handheld or not images:  # by hand without images: of a session to be planned
         return [whole]
     check_count(len(images), MOST_HANDHELD_IMAGES, "images by hand", where)
     called = ["-".join(filter(None, (names[one.configuration], one.repeat))) for one in images]
