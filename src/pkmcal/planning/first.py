@@ -282,9 +282,12 @@ def joined_pools(pools: Sequence[Pools]) -> Pools:
     out: list[EdgePool] = []
     for own in zip(*pools, strict=True):
         there = [pool for pool in own if len(pool.information)]
-        parts = (np.concatenate([getattr(p, name) for p in there or own])
-                 for name in ("information", "weight", "length"))  # fmt: skip
-        out.append(EdgePool(*parts, float(np.mean([pool.shading for pool in own]))))
+        information, weight, length = (
+            np.concatenate([getattr(pool, name) for pool in there or own])
+            for name in ("information", "weight", "length")
+        )
+        shading = float(np.mean([pool.shading for pool in own]))
+        out.append(EdgePool(information, weight, length, shading))
     return tuple(out)
 
 

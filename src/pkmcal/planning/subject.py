@@ -310,14 +310,17 @@ def _handheld_subject(
     first = replace(by_hand[0], name=by_hand[0].entry)
     rest = replace(session, stations=(first,), trackers=(), links=())
     planned = subject_of_session(rest, saved, anywhere=True, edge=edge, corner=corner, seed=seed)
-    placed = [] if saved is None else [one for one in by_hand if one.name in saved.placed]
     planned = replace(planned, handheld=True)
+    localized = set[str]() if saved is None else {station.name for station in saved.stations}
+    placed = [station for station in by_hand if station.name in localized]
     if saved is None or not placed or "legs" not in first.observe:
         return planned
-    known = [placed[k] for k in spread_over(np.arange(len(placed)))]
-    seen = replace(session, machine=saved.machine, stations=tuple(known), trackers=(), links=())
-    images, T_camera_base = read_images(seen), _saved_station_poses(seen, saved)
-    rows = [np.zeros(1, dtype=int)] * len(images)
+    chosen = spread_over(np.arange(len(placed)), most=PLAN_IMAGES_A_STATION)
+    known = tuple(placed[k] for k in chosen)
+    seen = replace(session, machine=saved.machine, stations=known, trackers=(), links=())
+    images, rows = read_images(seen), [np.zeros(1, dtype=int)] * len(known)
+    T_base_camera = {station.name: station.T_base_camera for station in saved.stations}
+    T_camera_base = inverse(np.stack([T_base_camera[station.name] for station in known]))
     measured = first_edges(seen, images, rows, T_camera_base, platform_poses(seen))
     pools = joined_pools(measured.pools)
     rig = planned.rig
@@ -328,7 +331,7 @@ def _handheld_subject(
     shading = measured.estimate.statistics.shading
     words = f"The accuracy of edges is measured in {len(known)} images that the calibration has."
     rig = replace(rig, instruments=instruments, shading=shading)
-    return replace(planned, rig=rig, words=(planned.words[0], words))
+    return replace(planned, rig=rig, words=(*planned.words[:-1], words))
 
 
 def _steps(session: Session) -> Array:

@@ -36,7 +36,8 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
     block = Space(
         title="",
         caption="The slider takes the machine through the configurations in their order; points are"
-        " the platform's positions, by the stations that measure them."
+        " the platform's positions"
+        + ("." if plan.subject.handheld else ", by the stations that measure them.")
         + (" The larger a camera's place, the better it is alone." if plan.tried else ""),
         alt="The machine in three dimensions at the configurations of the plan, with the cameras.",
         machine=machine_shape(
