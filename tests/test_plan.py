@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,7 +18,7 @@ from document_keys import assert_keys
 from page_documents import page_blocks, page_document
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.errors import InputError
-from pkmcal.files import read_csv
+from pkmcal.files import csv_text, read_csv
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.covariance import machine_covariance
@@ -34,9 +35,11 @@ from pkmcal.planning.information import CandidateRows, Candidates, information_o
 from pkmcal.planning.plan import PLAN, plan_measurements
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
 from pkmcal.planning.route import length, motor_distances, shortest_path
-from pkmcal.planning.subject import of_machine, subject_of_session
-from pkmcal.session.load import load_session
-from pkmcal.simulation import board_for
+from pkmcal.planning.subject import of_machine
+from pkmcal.session.load import load_session, load_session_to_plan
+from pkmcal.simulation import Settings, board_for, draw_truth
+from pkmcal.simulation.rehearsal import rehearsal_of
+from pkmcal.simulation.truth import RequestedConfigurations
 
 SIZE = (640, 480)
 
@@ -365,6 +368,46 @@ def test_a_session_before_any_image(demo, quick_plans, tmp_path):
     assert run("calibrate", str(session)).code == 2
 
 
+def test_a_plan_in_the_units_and_steps_of_the_readings(demo, quick_plans, tmp_path):
+    session = tmp_path / "session"
+    shutil.copytree(demo.session, session, ignore=shutil.ignore_patterns("images", "truth.json"))
+    document = yaml.safe_load((session / "session.yaml").read_text())
+    document["joints"]["noise"] = 7e-6
+    (session / "session.yaml").write_text(yaml.safe_dump(document))
+    table = read_csv(session / "joints.csv")
+    hundredths = np.round(1e5 * table.values) / 100
+    (session / "joints.csv").write_text(
+        csv_text([f"{name} [mm]" for name in table.columns], table.names, hundredths)
+    )
+    assert run("plan", str(session), "-n", "3").code == 0
+    text = (session / "plan" / "plan.csv").read_text()
+    assert text.startswith("configuration,leg1 [mm],leg2 [mm],leg3 [mm]")
+    planned = read_csv(session / "plan" / "plan.csv")
+    steps = 1e5 * planned.values
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    # its rehearsal has its names, its noise and its configurations
+    rehearsal = rehearsal_of(session / "plan")
+    loaded = load_session_to_plan(session)
+    assert rehearsal.requested.names == planned.names
+    assert rehearsal.requested.stations == loaded.station_names
+    assert (rehearsal.joint_noise, rehearsal.observe) == (7e-6, ("legs",))
+    np.testing.assert_allclose(rehearsal.requested.joints, planned.values, atol=1e-9)
+
+
+def test_a_rehearsal_leaves_out_what_the_true_machine_cannot_take():
+    machine = load_mechanism("gough-stewart")
+    cameras = (camera_of_size(SIZE),)
+    truth = draw_truth(machine, cameras, Settings(stations=1, configurations=4), 0)
+    joints = np.concatenate([truth.joints[:1], [[9.0] + [0.5] * 5], truth.joints[1:]])
+    pairs = np.stack([np.zeros(5, dtype=int), np.arange(5)], axis=-1)
+    asked = RequestedConfigurations(tuple("abcde"), joints, ("front",), pairs)
+    drawn = draw_truth(machine, cameras, Settings(stations=1, asked=asked), 0)
+    assert (drawn.stations, drawn.configurations) == (("front",), tuple("acde"))
+    assert drawn.unreachable == ("b",)
+    assert drawn.images.tolist() == [[0, 0], [0, 1], [0, 2], [0, 3]]
+    assert len(drawn.readings) == len(drawn.T_base_platform) == 4
+
+
 def test_a_session_without_places(demo, quick_plans, tmp_path):
     session = tmp_path / "session"
     shutil.copytree(demo.session, session, ignore=shutil.ignore_patterns("images", "truth.json"))
@@ -411,11 +454,49 @@ def test_a_camera_that_sees_nothing():
         small(replace(subject, rig=rig))
 
 
-def test_a_hand_held_session_is_not_planned(demo):
-    session = load_session(demo.session)
-    stations = tuple(replace(s, handheld=True) for s in session.stations)
-    with pytest.raises(InputError, match="no fixed pose to plan for"):
-        subject_of_session(replace(session, stations=stations))
+def test_two_images_of_each_configuration_by_hand():
+    """Each image has its own place; the plan is better than chance, and is what it promises."""
+    subject = replace(hexapod(1), handheld=True)
+    plan = small(subject)
+    assert len(plan.names) == 5
+    assert plan.stations == tuple((f"{name}-1", f"{name}-2") for name in plan.names)
+    rig = plan.subject.rig
+    assert rig.names == tuple(image for images in plan.stations for image in images)
+    assert plan.promised.position < plan.by_chance.position < plan.now.position
+    # all images together in one problem, each with a place of its own
+    number = {name: s for s, name in enumerate(rig.names)}
+    pairs = [(number[image], k) for k, images in enumerate(plan.stations) for image in images]
+    edges = rig.measured(plan.joints, plan.T_base_platform, np.array(pairs))
+    assembled, state = rig.assembled(edges, plan.T_base_platform)
+    info = assembled.problem.linearize(state)
+    assert len(edges.edges) > 5 * 12
+    assert np.unique(edges.edges.station).size == 10
+    assert info is not None
+
+
+def test_a_hand_held_session_is_planned_and_rehearsed(demo, quick_plans, tmp_path):
+    session = tmp_path / "session"
+    shutil.copytree(demo.session, session, ignore=shutil.ignore_patterns("images", "truth.json"))
+    document = yaml.safe_load((session / "session.yaml").read_text())
+    (camera,) = {station["camera"] for station in document["stations"].values()}
+    document["stations"] = {
+        "phone": {
+            "camera": camera, "images": "images/{configuration}-{repeat}.jpg", "observe": "legs",
+            "handheld": True,
+        }
+    }  # fmt: skip
+    (session / "session.yaml").write_text(yaml.safe_dump(document))
+    result = run("plan", str(session), "-n", "3", "--json")
+    assert result.code == 0, result.out + result.err
+    assert result.json["handheld"]
+    assert [one["stations"] for one in result.json["configurations"]] == [
+        [f"{one['name']}-1", f"{one['name']}-2"] for one in result.json["configurations"]
+    ]
+    rehearsal = rehearsal_of(session / "plan")
+    settings = Settings(stations=rehearsal.places, asked=rehearsal.requested, handheld=True)
+    truth = draw_truth(rehearsal.machine, rehearsal.cameras, settings, 0)
+    assert truth.stations == tuple(f"phone-{image}" for image in rehearsal.requested.stations)
+    assert len(truth.focal_scale) == 6
 
 
 @pytest.mark.slow

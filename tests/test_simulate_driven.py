@@ -261,6 +261,24 @@ def test_all_stations_see_the_board_on_the_platform(h4):
         assert np.mean(into < 0) > 0.7  # the printed side
 
 
+@pytest.mark.parametrize("name", ["3-rpr", "four-belt"])
+def test_the_board_of_a_planar_machine_stands_above_its_joints(name):
+    machine = with_forearms(load_mechanism(name))
+    board = board_for(machine, "platform")
+    settings = Settings(stations=1, configurations=4, board=board, board_on="platform")
+    truth = draw_truth(machine, (SMALL,), settings, 0)
+    places = truth.T_base_platform @ truth.T_platform_board
+    values = machine.values
+    ends = [
+        limb_ends(machine.layout, values, *at).b
+        for at in zip(truth.joints, truth.T_base_platform, strict=True)
+    ]
+    joints = apply(truth.T_base_platform[:, None], np.array(ends))[..., 2]
+    assert apply(places[:, None], board.points)[..., 2].min() > joints.max()
+    eye = inverse(truth.T_camera_base)[0, :3, 3]
+    assert np.all(apply(inverse(places), eye)[:, 2] < 0)  # the printed side
+
+
 def test_hinges_of_side_bars_cannot_be_drawn(tmp_path):
     with pytest.raises(InputError, match="turn on hinges"):
         simulate_session(tmp_path / "s", with_forearms(load_mechanism("h4-rods")), SMALL)

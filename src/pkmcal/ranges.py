@@ -121,7 +121,7 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
             "configurations": _whole(2, MOST_CONFIGURATIONS, 15),
             "repeats": _whole(1, 100, 1),
             "tolerance": Range(0, 100, default=1.0),
-            "joint_noise": Range(0, 1, above=True, default=GOOD_ENCODER_SIGMA, unit="m or rad"),
+            "joint_noise": Range(0, 1, above=True, unit="m or rad"),
             "noise": Range(0, 255, default=0.9),
             "blur": Range(0, 20, default=0.6),
             "rough_position": Range(0, 100),

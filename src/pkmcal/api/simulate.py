@@ -18,10 +18,10 @@ from pkmcal.errors import InputError
 from pkmcal.files import closest, resolved, staged_folder
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.outcome import Outcome, Verdict
-from pkmcal.outcome.finding import note
+from pkmcal.outcome.finding import Finding, Level, finding, note
 from pkmcal.outcome.progress import Progress, whole
 from pkmcal.placement.default_camera import camera_of_size, default_camera
-from pkmcal.ranges import RANGES, check_number, default
+from pkmcal.ranges import GOOD_ENCODER_SIGMA, RANGES, check_number, default
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Sensor, Settings, Truth, board_for, simulate_session, to_simulate
 from pkmcal.simulation.rehearsal import Rehearsal, rehearsal_of
@@ -46,7 +46,11 @@ class SimulationResult(Session, Result):
     def outcome(self) -> Outcome:
         """Verdict with the number of images and stations."""
         images, places = self.images_taken, count(len(self.station_names), "place")
-        findings = (note("session.cylinders_added", self.machine.name),)
+        findings: list[Finding] = []
+        if self.cylinders_added:
+            findings.append(note("session.cylinders_added", self.machine.name))
+        if self.truth and (names := self.truth.unreachable):
+            findings.append(finding("session.unreachable", Level.DOUBTFUL, names=names))
         return Outcome(
             command="simulate",
             title=f"Simulated session of {self.machine.name}",
@@ -55,7 +59,7 @@ class SimulationResult(Session, Result):
                 f"{count(images, 'image')} of {self.machine.name} from {places} in {self.folder};"
                 " the truth is in its truth.json, which no calibration reads.",
             ),
-            findings=findings if self.cylinders_added else (),
+            findings=tuple(findings),
             document={
                 "photographs": images,
                 "stations": self.station_names,
@@ -128,7 +132,9 @@ def simulate(
     noise, blur :
         Standard deviations of a pixel's noise, grey levels, and of the lens's blur, px.
     plan :
-        Folder of a plan, whose machine, cameras, stations and configurations are simulated.
+        Folder of a plan, whose machine, cameras, stations, configurations and, without
+        ``joint_noise``, noise of a reading are simulated. Configurations that the true machine
+        cannot take are left out, with a finding.
     seed :
         Seed for all random numbers.
     progress :
@@ -168,6 +174,8 @@ def simulate(
     else:
         fixed = board_for(machine, place) if board or on_platform else None
     given |= {"board": fixed, "board_on": place}
+    if given.get("joint_noise") is None:
+        given["joint_noise"] = planned.joint_noise if planned else GOOD_ENCODER_SIGMA
     setting = Settings(**given)
     eye = planned.cameras if planned else _camera(camera)
     with whole(progress, "Rendering") as report:
@@ -192,10 +200,12 @@ def _camera(camera: Camera | Path | str | tuple[int, int] | None) -> Camera:
 
 def _rehearsed(settings: Settings, planned: Rehearsal) -> Settings:
     """Settings with the stations, the configurations and the board of a plan."""
-    settings = replace(settings, stations=planned.places, asked=planned.requested)
-    return (
-        replace(settings, board=planned.board, board_on="platform") if planned.board else settings
+    settings = replace(
+        settings, stations=planned.places, asked=planned.requested, handheld=planned.handheld
     )
+    if planned.board is None:
+        return settings
+    return replace(settings, board=planned.board, board_on="platform", observe=planned.observe)
 
 
 def _check_settings(settings: Mapping[str, Any]) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 from pkmcal.commands import console
 from pkmcal.commands.finish import answer
 from pkmcal.commands.options import argument, as_json, choice, command, flag, number, option, seed
-from pkmcal.ranges import Light, Style
+from pkmcal.ranges import GOOD_ENCODER_SIGMA, Light, Style
 
 EXAMPLES = """\
 pkmcal simulate session
@@ -35,12 +35,18 @@ IMAGES, BOARD = "Images", "Board"
     number(
         "simulate", "tolerance", "X", "Standard deviation of the true geometry, in prior sigmas."
     ),
-    number("simulate", "joint_noise", "M", "Sigma of a joint reading, m or rad."),
+    number(
+        "simulate", "joint_noise", "M", "Sigma of a joint reading, m or rad.",
+        usual=f"the plan's, or {GOOD_ENCODER_SIGMA:g}",
+    ),
     number(
         "simulate", "warming", "K", "Warming of the machine over the session, kelvin; its"
         " temperatures are then in joints.csv."
     ),
-    option("--plan", "PLAN", "Folder of a plan: its machine, stations and configurations.", Path),
+    option(
+        "--plan", "PLAN", "Folder of a plan: its machine, stations, what they observe, and"
+        " configurations.", Path,
+    ),
     seed("simulate"),
     option("--camera", "FILE", "Camera file, instead of --size.", Path, group=IMAGES),
     option("--size", "WxH", "Image size, px. [default: 800x600]", group=IMAGES),

@@ -34,10 +34,14 @@ _KINDS = {
 
 
 class Unit(NamedTuple):
-    """Factor of a unit to the SI unit ``kind``: "m", "rad" or "" (parts of 1)."""
+    """Factor of a unit to the SI unit ``kind``: "m", "rad" or "" (parts of 1).
+
+    name : as it is written.
+    """
 
     factor: float
     kind: str
+    name: str
 
 
 @cache
@@ -53,7 +57,7 @@ def unit(name: str) -> Unit | None:
     # decibels and pi are dimensionless, too
     if kind is None or (kind == "" and name not in SHARE_UNIT_NAMES):
         return None
-    return Unit(float(factor), kind)
+    return Unit(float(factor), kind, name)
 
 
 @cache

@@ -277,6 +277,20 @@ def _pools(
     return tuple(out)
 
 
+def joined_pools(pools: Sequence[Pools]) -> Pools:
+    """Pools of several stations' edges as one station's, such as of hand-held images."""
+    out: list[EdgePool] = []
+    for own in zip(*pools, strict=True):
+        there = [pool for pool in own if len(pool.information)]
+        information, weight, length = (
+            np.concatenate([getattr(pool, name) for pool in there or own])
+            for name in ("information", "weight", "length")
+        )
+        shading = float(np.mean([pool.shading for pool in own]))
+        out.append(EdgePool(information, weight, length, shading))
+    return tuple(out)
+
+
 def drawn_edges(
     machine: Machine, edges: EdgeSet, pools: Sequence[Pools], rng: np.random.Generator | None
 ) -> EdgeSet:

@@ -17,12 +17,12 @@ so that no frame is preferred.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import InputError
 from pkmcal.identify.gauge import (
@@ -60,27 +60,33 @@ class Candidates:
     group : (n,) index of the group, in increasing order.
     joints : (n, m) readings.
     T_base_platform : (n, 4, 4).
+    even : (n,) whether they were drawn evenly over the joints' ranges.
     """
 
     groups: tuple[tuple[int, ...], ...]
     group: Integers
     joints: Array
     T_base_platform: Array
+    even: Booleans
 
     @classmethod
     def of_all(
         cls, groups: tuple[tuple[int, ...], ...], joints: Array, T_base_platform: Array
     ) -> Candidates:
-        """Candidates with each of K configurations for each of the groups."""
-        n = len(groups)
-        group = np.repeat(np.arange(n), len(joints))
+        """Candidates with each of K configurations for each of the groups.
+
+        The second half of the configurations is taken to be spread evenly.
+        """
+        n, count = len(groups), len(joints)
+        group = np.repeat(np.arange(n), count)
         poses = np.tile(T_base_platform, (n, 1, 1))
-        return cls(groups, group, np.tile(joints, (n, 1)), poses)
+        even = np.tile(np.arange(count) >= count // 2, n)
+        return cls(groups, group, np.tile(joints, (n, 1)), poses, even)
 
     def only(self, chosen: Integers) -> Candidates:
         """Selected candidates, which must be in increasing order of their groups."""
-        parts = self.group[chosen], self.joints[chosen], self.T_base_platform[chosen]
-        return Candidates(self.groups, *parts)
+        parts = self.joints[chosen], self.T_base_platform[chosen], self.even[chosen]
+        return Candidates(self.groups, self.group[chosen], *parts)
 
     @property
     def pairs(self) -> Integers:
@@ -136,6 +142,15 @@ class CandidateRows:
         whitened = np.linalg.solve(half, (self.machine / scale).T)
         return whitened.T @ whitened
 
+    def alone(self) -> CandidateRows:
+        """Candidates that share no unknowns but the machine's: what each of them tells of it by
+        itself, stations, shading and mounts eliminated.
+        """
+        start = np.linalg.inv(self.covariance(self.information))
+        each = np.stack([self.covariance(self.of(np.array([k]))) for k in range(len(self.rows))])
+        rows = rows_of_information(np.linalg.inv(each) - start)
+        return replace(self, rows=rows, information=start, machine=np.eye(len(start)))
+
     def tool(self, covariance: Array) -> tuple[float, float]:
         """Standard deviations of the platform's position (m) and turn (rad) for a covariance (p,
         p).
@@ -145,6 +160,14 @@ class CandidateRows:
         variance = np.einsum("kap,pq,kaq->ka", self.work, covariance, self.work, optimize=True)
         shift, turn = variance[:, 3:].sum(axis=1), variance[:, :3].sum(axis=1)
         return float(np.sqrt(shift).mean()), float(np.sqrt(turn).mean())
+
+
+def rows_of_information(information: Array) -> Array:
+    """Rows R (n, p, p) with ``R^T R`` an information (n, p, p), whose smallest eigenvalues may be
+    rounding.
+    """
+    eigenvalues, vectors = np.linalg.eigh(information)
+    return np.asarray(np.sqrt(np.maximum(eigenvalues, 0.0))[..., None] * vectors.mT)
 
 
 def information_of(

@@ -7,6 +7,7 @@ estimate would state.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import count as count_from
 from itertools import pairwise
@@ -30,7 +31,12 @@ from pkmcal.planning.candidates import (
 )
 from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
 from pkmcal.planning.exchange import ShareProgress, exchanged, greedy, tool_variance, tool_weight
-from pkmcal.planning.information import CandidateRows, Candidates, information_of
+from pkmcal.planning.information import (
+    CandidateRows,
+    Candidates,
+    information_of,
+    rows_of_information,
+)
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
 from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import Subject
@@ -54,6 +60,8 @@ class PlanOptions:
     work_poses: int = 60
     # most rounds of local improvement
     rounds: int = 8
+    # pairs of places from which hand-held images are taken of a configuration
+    handheld_pairs: int = 48
     # camera poses on each ring around the machine, and configurations for their comparison
     poses_a_ring: int = 12
     for_stations: int = 24
@@ -192,11 +200,17 @@ def plan_measurements(
         tracked = any(isinstance(one, TargetFrom) for one in rig.instruments)
         several = tracked or len(np.unique(rig.camera_of_station)) > 1
         together = len(rig.names) > 1 and several
-    stations = range(len(rig.names))
-    groups = (tuple(stations),) if together else tuple((s,) for s in stations)
-    # The best configurations for these stations.
-    selection = _Selection(rig, subject.prior, groups, count, work, options)
-    pool = selection.pool(Candidates.of_all(groups, *candidates))
+    # The best configurations for these stations, or with pairs of hand-held images.
+    if subject.handheld:
+        together = True
+        rig = _on_sphere(rig, options.poses_a_ring)[0]
+        groups, every = _with_pairs(rig, candidates, options.handheld_pairs, rng)
+    else:
+        stations = range(len(rig.names))
+        groups = (tuple(stations),) if together else tuple((s,) for s in stations)
+        every = Candidates.of_all(groups, *candidates)
+    selection = _Selection(rig, subject.prior, groups, count, work, options, subject.handheld)
+    pool = selection.pool(every)
     chosen = selection.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
     progress(0.9)
     return _routed_plan(subject, selection, chosen, pool, region, together, tried, rng)
@@ -238,7 +252,11 @@ class _Pool(NamedTuple):
 
 @dataclass(frozen=True)
 class _Selection:
-    """Selection of configurations for a rig, with its options."""
+    """Selection of configurations for a rig, with its options.
+
+    handheld : whether each configuration has images of its own, from places that no other has; then
+        the groups compete for ``count`` configurations in all.
+    """
 
     rig: Rig
     prior: CalibrationPrior | None
@@ -246,11 +264,30 @@ class _Selection:
     count: int
     work: Array
     options: PlanOptions
+    handheld: bool = False
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups of which each gets its own configurations."""
+        return 1 if self.handheld else len(self.groups)
 
     def pool(self, candidates: Candidates, rng: np.random.Generator | None = None) -> _Pool:
         """Candidates with their rows. rng : as in :func:`information_of`."""
         rig, work, prior = self.rig, self.work, self.prior
-        return _Pool(candidates, information_of(rig, candidates, work, prior, rng, self.count))
+        if not self.handheld:
+            return _Pool(candidates, information_of(rig, candidates, work, prior, rng, self.count))
+        infos: list[CandidateRows] = []
+        for g in np.unique(candidates.group):
+            own = candidates.only(np.flatnonzero(candidates.group == g))
+            own = replace(own, groups=((0, 1),), group=np.zeros_like(own.group))
+            info = information_of(rig.only(self.groups[g]), own, work, prior, rng, 1)
+            infos.append(info.alone())
+        rows, where = ([getattr(info, name) for info in infos] for name in ("rows", "where"))
+        group = np.zeros_like(candidates.group)
+        whole = replace(
+            infos[0], rows=np.concatenate(rows), where=np.concatenate(where), group=group
+        )
+        return _Pool(candidates, whole)
 
     def chosen(self, pool: _Pool, rng: np.random.Generator, progress: ShareProgress) -> Candidates:
         """Best candidates of a pool, improved locally."""
@@ -282,13 +319,16 @@ class _Selection:
         start: list[Integers] = []
         for g in range(len(self.groups)):
             own = np.flatnonzero(best.group == g)
+            if not own.size:
+                continue
             now = Configurations(best.joints[own], best.T_base_platform[own])
             near = neighbours(self.rig.machine, now, rng)
             start.append(sum(map(len, group)) + np.arange(len(own)))
             group.append(np.full(len(own) + len(near.joints), g))
             parts += [now, near]
         joints, poses = map(np.concatenate, zip(*parts, strict=True))
-        candidates = Candidates(self.groups, np.concatenate(group), joints, poses)
+        even = np.zeros(len(joints), dtype=bool)
+        candidates = Candidates(self.groups, np.concatenate(group), joints, poses, even)
         return self.pool(candidates), np.concatenate(start)
 
 
@@ -309,25 +349,34 @@ def _routed_plan(
     """Plan of the chosen configurations, in the order of the shortest path, with its predicted
     accuracy.
     """
-    machine, count, groups = subject.rig.machine, selection.count, selection.groups
+    machine, count, n_groups = subject.rig.machine, selection.count, selection.n_groups
     # edges with drawn rather than mean information, as real images have
     own = selection.pool(chosen, np.random.default_rng(PLAN_SEED)).info
     every = np.arange(len(chosen.group))
     # Accuracy by number of configurations, in the greedy order, and beyond the plan.
     nested = greedy(own, count)
-    curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
+    curve = [_accuracy(own, nested.path[c * n_groups - 1], c) for c in range(2, count)]
     covariance = own.covariance(own.of(every))
     promised = _accuracy(own, covariance, count)
     more = [_accuracy(own, own.covariance(own.of(every, t)), t * count) for t in CAPTURE_MULTIPLES]
     by_chance = _random_accuracy(selection, pool, rng)
     rank = np.empty(len(every), dtype=int)
-    rank[nested.chosen] = every // len(groups) + 1
+    rank[nested.chosen] = every // n_groups + 1
+    places = [selection.groups[g] for g in chosen.group]
+    if selection.handheld:  # one way through all of them
+        chosen = replace(chosen, groups=((),), group=np.zeros_like(chosen.group))
     order, blocked, travel = _route(machine, chosen, rng, selection.options)
+    names = _new_names(chosen.group[order], subject.names)
+    if selection.handheld:
+        rig, stations = _image_rig(selection.rig, [places[k] for k in order], names)
+        subject = replace(subject, rig=rig)
+    else:
+        stations = tuple(tuple(subject.rig.names[s] for s in places[k]) for k in order)
     return MeasurementPlan(
         subject=subject,
-        stations=tuple(tuple(subject.rig.names[s] for s in groups[chosen.group[k]]) for k in order),
-        names=_new_names(chosen.group[order], subject.names),
-        joints=chosen.joints[order],
+        stations=stations,
+        names=names,
+        joints=subject.commanded(chosen.joints[order]),
         T_base_platform=chosen.T_base_platform[order],
         rank=rank[order],
         now=_accuracy(own, own.covariance(own.information), 0),
@@ -359,13 +408,12 @@ def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
 
 def _random_accuracy(selection: _Selection, pool: _Pool, rng: np.random.Generator) -> Accuracy:
     """Accuracy with configurations drawn uniformly over the joints' ranges, mean of some draws."""
-    n_groups = len(selection.groups)
-    n = len(pool.info.group) // n_groups
-    evenly = np.arange(n // 2, n)  # the first half is at the ends of the ranges
-    count = min(selection.count, len(evenly))
+    even = pool.candidates.even
+    groups = [np.flatnonzero(even & (pool.info.group == g)) for g in range(selection.n_groups)]
+    count = min(selection.count, *map(len, groups))
     figures: list[tuple[float, float]] = []
     for _ in range(selection.options.random_plans):
-        rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(n_groups)]
+        rows = [rng.choice(rows, count, replace=False) for rows in groups]
         covariance = pool.info.covariance(pool.info.of(np.concatenate(rows)))
         figures.append(pool.info.tool(covariance))
     return Accuracy(selection.count, *np.mean(figures, axis=0).tolist())
@@ -438,6 +486,52 @@ def _blocked_steps(machine: Machine, joints: Array, poses: Array, home: Array, n
 # ------------------------------------------------------------------ places of the camera
 
 
+def _with_pairs(
+    rig: Rig, configurations: Configurations, count: int, rng: np.random.Generator
+) -> tuple[tuple[tuple[int, ...], ...], Candidates]:
+    """Pairs of a rig's stations, and candidates with each configuration for one of them.
+
+    A single image of similar legs often fits from two places, so a configuration has two images.
+    Both are drawn at random: configurations, of which there are many more than pairs, are then
+    chosen with their pair.
+    """
+    pairs = [tuple(sorted(rng.choice(len(rig.names), 2, replace=False))) for _ in range(count)]
+    n = len(configurations.joints)
+    group = rng.permutation(n) % count
+    order = np.argsort(group, kind="stable")
+    parts = configurations.joints[order], configurations.T_base_platform[order]
+    groups = tuple((int(a), int(b)) for a, b in pairs)
+    return groups, Candidates(groups, group[order], *parts, order >= n // 2)
+
+
+def _image_rig(
+    rig: Rig, places: Sequence[tuple[int, ...]], names: Sequence[str]
+) -> tuple[Rig, tuple[tuple[str, ...], ...]]:
+    """Rig with a station for each hand-held image, and the images' names by configuration.
+
+    places : stations of the rig from which each configuration's images are taken. names : of the
+    configurations.
+    """
+    spots = [s for pair in places for s in pair]
+    stations = tuple(
+        tuple(f"{name}-{repeat}" for repeat in range(1, len(pair) + 1))
+        for name, pair in zip(names, places, strict=True)
+    )
+    whole = replace(
+        rig,
+        names=tuple(image for images in stations for image in images),
+        T_station_base=rig.T_station_base[spots],
+        camera_of_station=rig.camera_of_station[spots],
+        instruments=tuple(
+            replace(one, station=k)
+            for k, s in enumerate(spots)
+            for one in rig.instruments
+            if one.station == s
+        ),
+    )
+    return whole, stations
+
+
 def _with_stations(
     subject: Subject,
     work: Array,
@@ -480,9 +574,7 @@ def _with_stations(
             covariance = info.covariance(info.of(np.arange(len(few)), count / len(few)))
             information[s] = np.linalg.inv(covariance) - start
         alone[s] = first.tool(covariance)[0]
-    # Rows R with R^T R = information, whose smallest eigenvalues may be rounding.
-    eigenvalues, vectors = np.linalg.eigh(information)
-    rows = np.sqrt(np.maximum(eigenvalues, 0.0))[..., None] * vectors.mT
+    rows = rows_of_information(information)
     # The best set of stations; distinct numbers, so that none counts as a repetition of another.
     same = np.zeros(len(rows), dtype=int)
     number = np.arange(len(rows), dtype=float)[:, None]

@@ -26,8 +26,10 @@ from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.saved_calibration import CalibrationPrior, SavedCalibration, load
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
+from pkmcal.files import Unit
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.start import start_mounts
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements import SHADING_SIGMA, Mount
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import first_binning
@@ -39,7 +41,7 @@ from pkmcal.planning.defaults import (
     NOMINAL_EDGE_SIGMA,
     UNTOLD_READING_NOISE,
 )
-from pkmcal.planning.first import Pools, first_edges, spread_over
+from pkmcal.planning.first import Pools, first_edges, joined_pools, spread_over
 from pkmcal.planning.rig import (
     BoardFrom,
     Instrument,
@@ -48,15 +50,18 @@ from pkmcal.planning.rig import (
     TargetFrom,
     nominal_pools,
 )
-from pkmcal.session.load import Session
+from pkmcal.session.load import Session, Station
+from pkmcal.session.readings import rounding_step
 from pkmcal.simulation.board import place_board
-from pkmcal.wording import brief, listed
+from pkmcal.wording import brief
 
 PLAN_IMAGES_A_STATION = 12
 """Maximum number of a station's images whose edges are measured; twice as many of all stations
 together. A plan is made once, and few edges determine the shading badly.
 """
 BOARD_MOUNT_NAME = "board"
+FINEST_STEP = 1e-6
+"""m or rad, step of a reading below which no drive moves."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,9 @@ class Subject:
 
     rig : machine and instruments.
     prior : prior of an earlier calibration.
-    columns : columns of joints.csv.
+    columns : columns of joints.csv. units : their units, None for SI; empty without any.
+    steps : (m,) of which all existing readings of a motor are multiples, m or rad, 0 for none.
+    handheld : whether its camera is held by hand; the rig's station stands for all its images.
     names : of existing configurations.
     words : sentences on the sources of its numbers.
     board : fields of the board's file, if a board is observed.
@@ -77,8 +84,18 @@ class Subject:
     names: tuple[str, ...]
     words: tuple[str, ...]
     board: dict[str, Any] | None = None
+    units: tuple[Unit | None, ...] = ()
+    steps: Array | None = None
+    handheld: bool = False
 
     __repr__ = short_repr
+
+    def commanded(self, joints: Array) -> Array:
+        """Readings (n, m) as the machine's controller takes them: multiples of the steps."""
+        if self.steps is None:
+            return joints
+        step = np.where(self.steps > 0, self.steps, 1.0)
+        return np.where(self.steps > 0, np.round(joints / step) * step, joints)
 
 
 def as_it_stands(
@@ -248,18 +265,14 @@ def subject_of_session(
     anywhere : whether poses of its first camera are to be chosen, so that none must be given.
     edge, corner : px, standard deviations for a session without images.
 
-    Raises InputError if the pose of a station is not known, or for hand-held cameras.
+    A session with a hand-held camera is planned for that camera alone. Raises InputError if the
+    pose of a station is not known.
     """
+    by_hand = [station for station in session.stations if station.handheld]
+    if by_hand and not anywhere:
+        return _handheld_subject(session, by_hand, saved, edge, corner, seed)
     if anywhere:
         session = _first_camera_session(session)
-    by_hand = [station.name for station in session.stations if station.handheld]
-    if by_hand:
-        raise InputError(
-            "a hand-held camera has no fixed pose to plan for",
-            where="session.yaml, stations",
-            found=listed(by_hand, 3),
-            next_step="Plan the places of a camera on a tripod: --places 3",
-        )
     words: list[str] = []
     if saved is not None:
         session = replace(session, machine=saved.machine)
@@ -276,7 +289,63 @@ def subject_of_session(
     columns = tuple(session.document["joints"]["columns"])
     names = session.configurations
     fields = board.document if board else None
-    return Subject(rig, prior, columns, names, (*words, *corner_source), fields)
+    return Subject(
+        rig, prior, columns, names, (*words, *corner_source), fields, session.reading_units,
+        _steps(session),
+    )  # fmt: skip
+
+
+def _handheld_subject(
+    session: Session,
+    by_hand: Sequence[Station],
+    saved: SavedCalibration | None,
+    edge: float,
+    corner: float,
+    seed: int,
+) -> Subject:
+    """Subject with a session's hand-held camera.
+
+    by_hand : its images. Edges are as good as in those that the calibration has localized.
+    """
+    first = replace(by_hand[0], name=by_hand[0].entry)
+    rest = replace(session, stations=(first,), trackers=(), links=())
+    planned = subject_of_session(rest, saved, anywhere=True, edge=edge, corner=corner, seed=seed)
+    planned = replace(planned, handheld=True)
+    localized = set[str]() if saved is None else {station.name for station in saved.stations}
+    placed = [station for station in by_hand if station.name in localized]
+    if saved is None or not placed or "legs" not in first.observe:
+        return planned
+    chosen = spread_over(np.arange(len(placed)), most=PLAN_IMAGES_A_STATION)
+    known = tuple(placed[k] for k in chosen)
+    seen = replace(session, machine=saved.machine, stations=known, trackers=(), links=())
+    images, rows = read_images(seen), [np.zeros(1, dtype=int)] * len(known)
+    T_base_camera = {station.name: station.T_base_camera for station in saved.stations}
+    T_camera_base = inverse(np.stack([T_base_camera[station.name] for station in known]))
+    measured = first_edges(seen, images, rows, T_camera_base, platform_poses(seen))
+    pools = joined_pools(measured.pools)
+    rig = planned.rig
+    instruments = tuple(
+        replace(one, pools=pools, binning=images[0].binning) if isinstance(one, LegsFrom) else one
+        for one in rig.instruments
+    )
+    shading = measured.estimate.statistics.shading
+    words = f"The accuracy of edges is measured in {len(known)} images that the calibration has."
+    rig = replace(rig, instruments=instruments, shading=shading)
+    return replace(planned, rig=rig, words=(*planned.words[:-1], words))
+
+
+def _steps(session: Session) -> Array:
+    """Steps (m,) of a session's readings; 0 where they have none, or only few coarse values, whose
+    step is more than a negligible share of the motor's range.
+    """
+    spans = np.ptp(session.machine.joint_ranges, axis=1)
+    steps = np.zeros(len(spans))
+    for m, (unit, span) in enumerate(zip(session.machine.joint_units, spans, strict=True)):
+        readings = session.joints[:, m]
+        step = rounding_step(readings, unit, FINEST_STEP) if readings.any() else None
+        if step is not None and step <= NEGLIGIBLE * span:
+            steps[m] = step
+    return steps
 
 
 def _rig(

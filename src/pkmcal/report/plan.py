@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from pkmcal.cameras import Camera
 from pkmcal.files import csv_text, json_value, yaml_text
 from pkmcal.geometry.rigid import inverse
 from pkmcal.levels import NEGLIGIBLE
+from pkmcal.mechanisms.drives import ball_of, legs_space
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.placement.stations import StationPose
@@ -24,6 +26,10 @@ PLAN_TABLE_FILE, PLAN_STATIONS_FILE = "plan.csv", "stations.yaml"
 PLAN_FORMAT = 1
 PLAN_READING_DECIMALS = 6
 """Decimals of a reading in metres or radians."""
+HANDHELD_PLACES_TEXT = (
+    "From: directions of the two images from the middle of the machine, from its x towards its y"
+    " axis and above the level, and the distance; to ten degrees is enough. "
+)
 PLAN_METHOD_TEXT = (
     "Each candidate's rows are those of the joint estimate: the exact derivatives of its edges,"
     " corners, poses and readings, with the platform's pose of that configuration eliminated."
@@ -39,11 +45,7 @@ PLAN_METHOD_TEXT = (
 
 def outcome_of(plan: MeasurementPlan) -> Outcome:
     """Outcome of ``pkmcal plan``."""
-    texts: dict[str, str | bytes] = {
-        PLAN_TABLE_FILE: csv_text(
-            plan.subject.columns, plan.names, plan.joints.round(PLAN_READING_DECIMALS)
-        )
-    }
+    texts: dict[str, str | bytes] = {PLAN_TABLE_FILE: _table_text(plan)}
     parts = [_curve(plan)]
     if plan.tried:
         texts[PLAN_STATIONS_FILE] = yaml_text(stations_document(plan))
@@ -102,6 +104,22 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     )
 
 
+def _table_text(plan: MeasurementPlan) -> str:
+    """Readings in the columns and units of joints.csv."""
+    subject = plan.subject
+    units = subject.units or (None,) * len(subject.columns)
+    heads = [
+        name if unit is None else f"{name} [{unit.name}]"
+        for name, unit in zip(subject.columns, units, strict=True)
+    ]
+    values = plan.joints.copy()
+    for m, unit in enumerate(units):
+        factor = 1.0 if unit is None else unit.factor
+        decimals = PLAN_READING_DECIMALS + math.ceil(math.log10(factor))
+        values[:, m] = np.round(values[:, m] / factor, decimals)
+    return csv_text(heads, plan.names, values)
+
+
 def _accuracy_text(accuracy: Accuracy) -> str:
     """Accuracy of position and, if the platform turns, of orientation, in words."""
     words = f"position to {amount(accuracy.position, 'm')}"
@@ -113,7 +131,9 @@ def _accuracy_text(accuracy: Accuracy) -> str:
 def _purpose(plan: MeasurementPlan) -> str:
     """Purpose of the plan in a sentence."""
     where = ""
-    if len({name for names in plan.stations for name in names}) > 1:
+    if plan.subject.handheld:
+        where = " in two hand-held images each"
+    elif len({name for names in plan.stations for name in names}) > 1:
         where = " seen by all stations" if plan.together else " from each place"
     each = count(plan.promised.count, "configuration") + where
     return f"{each}, chosen for the least variance of the tool; workspace: {plan.region}."
@@ -140,11 +160,13 @@ def _order(plan: MeasurementPlan) -> Part:
         f"{name}, {DISPLAY_UNITS[unit][1]}"
         for name, unit in zip(plan.subject.columns, units, strict=True)
     ]
+    where = {name: _direction(plan, T) for name, _, T in _cameras(plan)}
+    by_hand = plan.subject.handheld
     rows = [
         Row(
             name,
             (
-                listed(who, 3),
+                "; ".join(where[image] for image in who) if by_hand else listed(who, 3),
                 str(int(rank)),
                 *(number(q * DISPLAY_UNITS[u][0], 2) for q, u in zip(joints, units, strict=True)),
             ),
@@ -157,13 +179,25 @@ def _order(plan: MeasurementPlan) -> Part:
         "In this order",
         ("Configuration", "from", "rank", *columns),
         tuple(rows),
-        f"The way from home is the shortest that was found. Rank: if fewer are wanted, those up to"
-        f" a rank are the best so many from each place. {PLAN_TABLE_FILE} holds the readings in"
-        " metres and radians; measured readings replace them.",
+        (HANDHELD_PLACES_TEXT if by_hand else "")
+        + "The way from home is the shortest that was found. Rank: if fewer are"
+        " wanted, those up to a rank are the best so many"
+        f"{'' if by_hand else ' from each place'}. {PLAN_TABLE_FILE} holds the readings in the"
+        " units of joints.csv; measured readings replace them.",
         brief=False,
         words=(1,),
     )
     return Part("order", "Configurations", tables=(table,))
+
+
+def _direction(plan: MeasurementPlan, T_camera_base: Array) -> str:
+    """Where a camera is from the middle of the machine's space, in words."""
+    centre = ball_of(legs_space(plan.subject.rig.machine))[0]
+    away = inverse(T_camera_base)[:3, 3] - centre
+    distance = float(np.linalg.norm(away))
+    azimuth = np.rad2deg(np.arctan2(away[1], away[0])) % 360
+    height = np.rad2deg(np.arcsin(away[2] / distance))
+    return f"{azimuth:.0f}°, {height:.0f}° up, {distance:.2g} m"
 
 
 def _curve(plan: MeasurementPlan) -> Part:
@@ -181,7 +215,7 @@ def _curve(plan: MeasurementPlan) -> Part:
         for a in few
     ]
     table = Table(
-        "Accuracy by the number from each place",
+        "Accuracy by the number" + ("" if plan.subject.handheld else " from each place"),
         ("Configurations", "position", *(["orientation"] if turns else [])),
         tuple(rows),
         "Standard deviations of the tool, mean over the workspace. Fewer: those of the lowest"
@@ -229,13 +263,9 @@ def _camera_poses(plan: MeasurementPlan) -> Part:
 
 def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
     """Chosen places as entries of session.yaml."""
-    rig, out = plan.subject.rig, dict[str, Any]()
+    out = dict[str, Any]()
     for name, _, T_camera_base in _cameras(plan):
-        observe = [
-            word
-            for word, kind in (("legs", LegsFrom), ("board", BoardFrom))
-            if any(isinstance(x, kind) and rig.names[x.station] == name for x in rig.instruments)
-        ]
+        observe = _observed(plan, name)
         out[name] = {
             "camera": "cameras/camera.yaml",
             "images": f"images/{name}/{{configuration}}.png",
@@ -243,6 +273,14 @@ def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
             "pose": StationPose.of(T_camera_base).rounded(3),
         }
     return {"stations": out}
+
+
+def _observed(plan: MeasurementPlan, name: str) -> list[str]:
+    """What a station observes, as in session.yaml."""
+    rig = plan.subject.rig
+    own = [one for one in rig.instruments if rig.names[one.station] == name]
+    kinds = (("legs", LegsFrom), ("board", BoardFrom))
+    return [word for word, kind in kinds if any(isinstance(one, kind) for one in own)]
 
 
 def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
@@ -261,12 +299,14 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
                 "turn": plan.region.turn,
             },
             "together": plan.together,
+            "handheld": plan.subject.handheld,
             "now": _accuracy_document(plan.now),
             "promised": _accuracy_document(plan.promised),
             "by_chance": _accuracy_document(plan.by_chance),
             "pays_until": plan.pays_until,
             "curve": [_accuracy_document(a) for a in plan.curve],
             "columns": list(plan.subject.columns),
+            "joint_noise": rig.joint_noise,
             "configurations": [
                 {
                     "name": name,
@@ -279,7 +319,10 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
                 for name, stations, rank, joints, T, blocked in joined
             ],
             "stations": [
-                {"name": name, "T_base_camera": inverse(T), "camera": camera.document()}
+                {
+                    "name": name, "T_base_camera": inverse(T), "camera": camera.document(),
+                    "observe": _observed(plan, name),
+                }
                 for name, camera, T in _cameras(plan)
             ],
             "places_tried": [

@@ -22,8 +22,9 @@ def curve_plot(plan: MeasurementPlan) -> Plot:
     x = [float(accuracy.count) for accuracy in plan.curve]
     y = [accuracy.position * 1e3 for accuracy in plan.curve]
     chance = plan.by_chance.position * 1e3
+    configurations = "configurations" + ("" if plan.subject.handheld else " from each place")
     best = tuple(
-        Point(x=n, y=rounded(sigma), tip=f"{n:g} from each place: {brief(sigma)} mm")
+        Point(x=n, y=rounded(sigma), tip=f"{n:g} {configurations}: {brief(sigma)} mm")
         for n, sigma in zip(x, y, strict=True)
     )
     by_chance = Point(
@@ -34,9 +35,9 @@ def curve_plot(plan: MeasurementPlan) -> Plot:
         title="How σ falls with the number of configurations",
         caption="Mean over the workspace, both axes logarithmic: by chance alone, four times as"
         " many halve it. Up to this plan's number the best of the plan; beyond it, each again.",
-        alt="The tool's standard deviation against the number of configurations from each place,"
-        f" from {brief(y[0])} to {brief(y[-1])} mm; the table has the numbers",
-        x=log_axis("configurations from each place", x),
+        alt="The tool's standard deviation against the number of"
+        f" {configurations}, from {brief(y[0])} to {brief(y[-1])} mm; the table has the numbers",
+        x=log_axis(configurations, x),
         y=log_axis("σ of the tool's position, mm", (*y, chance)),
         marks=(
             RuleMark(name="this plan", axis="x", at=float(here.count), colour="quiet"),

@@ -31,13 +31,13 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
     """
     machine = plan.subject.rig.machine
     postures = Postures(plan.joints, plan.T_base_platform)
-    points = list(_by_station(plan))
+    points = _by_station(plan)
     if plan.tried:
         points.append(_candidates(plan.tried))
     block = Space(
         title="",
-        caption="The machine at a configuration; points are the platform's positions, by the"
-        " stations that measure them."
+        caption="The machine at a configuration; points are the platform's positions"
+        + ("." if plan.subject.handheld else ", by the stations that measure them.")
         + (" The larger a camera's place, the better it is alone." if plan.tried else ""),
         alt="The machine in three dimensions at the configurations of the plan, with the cameras.",
         machine=machine_shape(
@@ -55,18 +55,20 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
 
 def _by_station(plan: MeasurementPlan) -> list[SpacePoints]:
     """Platform positions, one set for each group of stations that measure together."""
-    groups = list(dict.fromkeys(plan.stations))
+    where = [f"From {listed(names, 3)}" for names in plan.stations]
+    if plan.subject.handheld:  # each has its own
+        where = ["In two images each"] * len(where)
     out: list[SpacePoints] = []
-    for n, group in enumerate(groups):
-        rows = [k for k, own in enumerate(plan.stations) if own == group]
+    for n, words in enumerate(dict.fromkeys(where)):
+        rows = [k for k, own in enumerate(where) if own == words]
         names = [plan.names[k] for k in rows]
         out.append(
             space_points(
-                f"From {listed(group, 3)}",
+                words,
                 STATION_COLOURS[n % len(STATION_COLOURS)],
                 plan.T_base_platform[rows, :3, 3],
                 [configuration_key(name) for name in names],
-                [f"{name} (from {listed(group, 3)})" for name in names],
+                [f"{name} ({words[0].lower()}{words[1:]})" for name in names],
             )
         )
     return out

@@ -29,6 +29,7 @@ from pkmcal.files import (
     CsvTable,
     Document,
     Keys,
+    Unit,
     any_unit,
     check_count,
     check_regular,
@@ -147,6 +148,7 @@ class Session:
     temperature : (K,) °C, of the configurations; None where joints.csv has none.
     earlier_joints : (E, m) readings of the same machine at other poses; None for none. The
         localization of few images is tested against them as well.
+    reading_units : units in the heads of joints.csv's m columns, None for SI; empty without any.
     """
 
     folder: Path
@@ -167,6 +169,7 @@ class Session:
     links: tuple[LinkSet, ...] = ()
     temperature: Array | None = None
     earlier_joints: Array | None = None
+    reading_units: tuple[Unit | None, ...] = ()
 
     def __repr__(self) -> str:
         parts = (
@@ -359,6 +362,7 @@ def load_session(
         mechanism=source,
         workspace=_workspace(document, schema),
         links=links,
+        reading_units=table.units if any(table.units) else (),
     )
 
 
@@ -653,7 +657,7 @@ def _stations(
         name, camera, camera_file, T_camera_base, images, station.observe, name,
         station.handheld, from_exif, station.response or usual, station.response is not None,
     )  # fmt: skip
-    if not station.handheld:
+    if not station.handheld or not images:  # by hand without images: of a session to be planned
         return [whole]
     check_count(len(images), MOST_HANDHELD_IMAGES, "images by hand", where)
     called = ["-".join(filter(None, (names[one.configuration], one.repeat))) for one in images]

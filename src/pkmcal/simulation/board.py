@@ -236,12 +236,12 @@ def place_board(
 
 
 def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
-    """Candidates above the platform's plate, facing away from the base and to all sides."""
+    """Candidates beyond the board's foot, facing away from it and to all sides."""
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     reach = 0.6 * float(np.linalg.norm(high - low))
-    up = np.array([0.0, 0.0, discs.platform_side])
+    up = np.array([0.0, 0.0, discs.board_side])
     # below the plate the board would lie in the plate's shadow
-    out_of = discs.platform_radius if discs.platform_side < 0 else 0.0
+    out_of = discs.platform_radius if discs.board_side < 0 else 0.0
     out: list[Array] = []
     for direction, lean in product(
         2 * np.pi * (np.arange(12) + rng.random()) / 12, (0.3, 0.8, 1.3)
@@ -252,9 +252,7 @@ def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Arra
         right = right / np.linalg.norm(right)
         rot = np.stack([right, cross(into, right), into], axis=-1)
         rot = rotation(rng.normal(0, 0.05, 3)) @ rot
-        centre = (
-            discs.platform + (discs.thickness + np.sin(lean) * reach + 0.01) * up + out_of * side
-        )
+        centre = discs.board_foot + (np.sin(lean) * reach + 0.01) * up + out_of * side
         out.append(pose(rot, centre - rot @ ((low + high) / 2)))
     return out
 

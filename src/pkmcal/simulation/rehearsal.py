@@ -28,6 +28,7 @@ class _Part(Schema):
 
 
 class _Configuration(_Part):
+    name: str
     stations: tuple[str, ...]
     joints: tuple[float, ...]
 
@@ -39,6 +40,7 @@ class _Station(_Part):
     name: str
     T_base_camera: tuple[_Row, _Row, _Row, _Row]
     camera: dict[str, Any]
+    observe: tuple[Literal["legs", "board"], ...]
 
 
 class _Plan(_Part):
@@ -47,16 +49,25 @@ class _Plan(_Part):
     configurations: tuple[_Configuration, ...]
     stations: tuple[_Station, ...] = Field(min_length=1, description="the plan's cameras")
     board: dict[str, Any] | None = None
+    joint_noise: float
+    handheld: bool
 
 
 class Rehearsal(NamedTuple):
-    """Planned machine, cameras and their poses, configurations, and the board, if any."""
+    """Planned machine, cameras and their poses, configurations, and the board, if any.
+
+    observe : what the cameras observe. joint_noise : standard deviation of a reading, m or rad.
+    handheld : whether each image is from a place of its own.
+    """
 
     machine: Machine
     cameras: tuple[Camera, ...]
     places: tuple[StationPose, ...]
     requested: RequestedConfigurations
     board: Board | None
+    observe: tuple[str, ...]
+    joint_noise: float
+    handheld: bool
 
 
 def rehearsal_of(plan: Path | str) -> Rehearsal:
@@ -93,8 +104,16 @@ def rehearsal_of(plan: Path | str) -> Rehearsal:
         machine,
         tuple(camera_from_document(_inside(document, s.camera)) for s in results.stations),
         tuple(StationPose.of(inverse(np.array(s.T_base_camera))) for s in results.stations),
-        RequestedConfigurations(joints, np.array(pairs, dtype=int).reshape(-1, 2)),
+        RequestedConfigurations(
+            tuple(one.name for one in results.configurations),
+            joints,
+            tuple(number),
+            np.array(pairs, dtype=int).reshape(-1, 2),
+        ),
         None if results.board is None else board_from_document(_inside(document, results.board)),
+        tuple(dict.fromkeys(word for station in results.stations for word in station.observe)),
+        results.joint_noise,
+        results.handheld,
     )
 
 

@@ -78,6 +78,9 @@ class Discs:
     base_radius, platform_radius : m.
     side : +1 where the platform stands above the base along the frames' z, -1 below.
     platform_side : the same for the platform's plate relative to its joints.
+    board_foot : (3,) point beyond which the platform carries a board; platform frame.
+    board_side : the board's side of it: behind the plate, but before the joints of a planar
+        machine, where its cameras are.
     thickness : m.
     """
 
@@ -87,6 +90,8 @@ class Discs:
     platform_radius: float
     side: float
     platform_side: float
+    board_foot: Array
+    board_side: float
     thickness: float
     drives: Drives
 
@@ -118,9 +123,13 @@ def discs_of(machine: Machine) -> Discs:
     base[2] = (side * held[:, 2]).min() * side - side * drop
     platform[2] = (over * b[:, 2]).max() * over + over * lift * ball
     thickness = max(0.012, 0.8 * ball)
+    board_side = side if planar else over
+    foot = platform + board_side * thickness * np.array([0.0, 0.0, 1.0])
+    if planar:
+        foot[2] += 2.0 * (b[:, 2].mean() - platform[2])
     return Discs(
         base, platform, width_a + max(3.5 * ball, room), width_b + 2.0 * ball, side, over,
-        thickness, drives,
+        foot, board_side, thickness, drives,
     )  # fmt: skip
 
 

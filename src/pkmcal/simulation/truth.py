@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from pkmcal.placement.stations import (
     rough_pose,
     rough_poses,
 )
-from pkmcal.ranges import Light, Style, default
+from pkmcal.ranges import GOOD_ENCODER_SIGMA, Light, Style, default
 from pkmcal.session.load import load_session
 from pkmcal.session.readings import same_pose
 from pkmcal.session.schema import BoardBody
@@ -57,11 +58,13 @@ HANDHELD_STATION_NAME = "phone"
 class RequestedConfigurations:
     """Configurations that a caller requests, for example those of a plan.
 
-    joints : (n, m) readings. pairs : (M, 2) numbers of a station and of the configuration in its
-    image.
+    names, joints : (n,) and (n, m) readings. stations : names.
+    pairs : (M, 2) numbers of a station and of the configuration in its image.
     """
 
+    names: tuple[str, ...]
     joints: Array
+    stations: tuple[str, ...]
     pairs: Integers
 
 
@@ -86,7 +89,7 @@ class Settings:
     asked : requested configurations, instead of random ones.
     handheld : whether each image has a pose of its own around the machine, with ``repeats`` images
         of each configuration and focal lengths with the relative standard deviation ``breathing``;
-        ``stations`` is then ignored.
+        a number of ``stations`` is then ignored.
     warming : K, increase of the machine's temperature over the session. The readings contain the
         growth of drives and frame, the images show the machine as it is at first.
     """
@@ -95,7 +98,7 @@ class Settings:
     configurations: int = default("simulate", "configurations")
     shared: bool = False
     tolerance: float = default("simulate", "tolerance")
-    joint_noise: float = default("simulate", "joint_noise")
+    joint_noise: float = GOOD_ENCODER_SIGMA
     rough_position: float = 0.05
     rough_angle: float = float(np.deg2rad(5))
     extreme: float = 0.5
@@ -116,9 +119,9 @@ class Settings:
     @property
     def n_stations(self) -> int:
         """Number of stations; of images if the camera is hand-held."""
-        if self.handheld:
-            return self.configurations * self.repeats
-        return self.stations if isinstance(self.stations, int) else len(self.stations)
+        if not isinstance(self.stations, int):
+            return len(self.stations)
+        return self.configurations * self.repeats if self.handheld else self.stations
 
 
 @dataclass(frozen=True)
@@ -178,6 +181,7 @@ class Truth:
     repeats : number of images of each pair.
     focal_scale : (S,) factors on the camera's focal lengths, for hand-held images.
     effects : on the readings: temperatures, growth and compliance.
+    unreachable : names of requested configurations that the true machine cannot take.
     """
 
     machine: Machine
@@ -195,6 +199,7 @@ class Truth:
     T_platform_board: Array | None = None
     focal_scale: Array | None = None
     effects: TrueEffects | None = None
+    unreachable: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -227,7 +232,7 @@ def draw_truth(
     rngs = {name: np.random.default_rng(stream(seed, name)) for name in RANDOM_STREAMS}
     machine = true_machine(nominal, settings.tolerance, rngs["machine"])
     poses = settings.stations
-    if settings.handheld:
+    if isinstance(poses, int) and settings.handheld:
         poses = rough_poses(nominal, cameras, rngs["stations"])
     elif isinstance(poses, int):
         in_view = settings.board_on if settings.board is not None else None
@@ -244,31 +249,30 @@ def draw_truth(
         for T, pose in zip(T_camera_base, poses, strict=True)
     )
     # configurations, board, noise of the readings
-    T_base_platform, joints, images = _configurations(
-        nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
-    )
+    asked = settings.asked
+    if asked is None:
+        T_base_platform, joints, images = _configurations(
+            nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
+        )
+        configurations, unreachable = tuple(f"{k:04d}" for k in range(len(joints))), ()
+        names = tuple(f"station{k + 1}" for k in range(len(poses)))
+        if settings.handheld:
+            each = enumerate(configurations[k] for k in images[:, 1])
+            names = tuple(f"{name}-{s % settings.repeats + 1}" for s, name in each)
+    else:
+        taken, T_base_platform, joints, images = _at_requested(nominal, machine, asked)
+        configurations = tuple(compress(asked.names, taken))
+        names, unreachable = asked.stations, tuple(compress(asked.names, ~taken))
     board = None
     if settings.board is not None:
         board = place_board(
-            machine,
-            settings.board,
-            settings.board_on,
-            cameras,
-            T_camera_base,
-            T_base_platform,
-            joints,
-            rngs["board"],
-        )
+            machine, settings.board, settings.board_on, cameras, T_camera_base, T_base_platform,
+            joints, rngs["board"],
+        )  # fmt: skip
     noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
     effects = TrueEffects.draw(nominal, settings.warming, len(joints), rngs["effects"])
-    configurations = tuple(f"{k:04d}" for k in range(len(joints)))
-    names = tuple(f"station{k + 1}" for k in range(len(poses)))
     if settings.handheld:
-        taken = enumerate(images[:, 1].tolist())
-        names = tuple(
-            f"{HANDHELD_STATION_NAME}-{configurations[k]}-{s % settings.repeats + 1}"
-            for s, k in taken
-        )
+        names = tuple(f"{HANDHELD_STATION_NAME}-{name}" for name in names)
     return Truth(
         machine=machine,
         stations=names,
@@ -287,6 +291,7 @@ def draw_truth(
         if settings.handheld
         else None,
         effects=effects,
+        unreachable=unreachable,
     )
 
 
@@ -303,8 +308,6 @@ def _configurations(
     A controller with the nominal model only moves the machine to poses that the nominal model
     reaches.
     """
-    if settings.asked is not None:
-        return _at_requested(nominal, machine, settings.asked)
     n, repeats = settings.configurations, settings.repeats
     wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
@@ -379,18 +382,23 @@ def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) 
 
 def _at_requested(
     nominal: Machine, machine: Machine, request: RequestedConfigurations
-) -> tuple[Array, Array, Integers]:
-    """Poses of the true machine at the requested readings, the readings and their pairs."""
+) -> tuple[Booleans, Array, Array, Integers]:
+    """Which of the requested readings the machine can take; of these the poses of the true machine,
+    its readings, and the pairs of stations and configurations.
+    """
     by_nominal = nominal.forward_result(request.joints)
     fk = driven_towards(machine.layout, machine.values, request.joints, by_nominal.T_base_platform)
-    bad = np.flatnonzero(~(fk.converged & by_nominal.converged))
-    if bad.size:
+    taken = np.asarray(fk.converged & by_nominal.converged)
+    if taken.sum() < 2:
+        bad = int(np.argmin(taken))
         raise GeometryError(
-            what="the machine cannot take a configuration that was asked for",
-            found=", ".join(f"{q:.4g}" for q in request.joints[bad[0]]),
-            expected="readings at which all legs reach the platform",
+            what="the machine cannot take the configurations that were asked for",
+            found=f"{request.names[bad]}: " + ", ".join(f"{q:.4g}" for q in request.joints[bad]),
+            expected="two at least at which all legs reach the platform",
         )
-    return fk.T_base_platform, fk.readings, request.pairs
+    pairs = request.pairs[taken[request.pairs[:, 1]]]
+    pairs = np.stack([pairs[:, 0], np.cumsum(taken)[pairs[:, 1]] - 1], axis=-1)
+    return taken, fk.T_base_platform[taken], fk.readings[taken], pairs
 
 
 def truth_document(truth: Truth) -> dict[str, Any]:
