@@ -463,15 +463,24 @@ def test_two_images_of_each_configuration_by_hand():
     rig = plan.subject.rig
     assert rig.names == tuple(image for images in plan.stations for image in images)
     assert plan.promised.position < plan.by_chance.position < plan.now.position
-    # all images together in one problem, each with a place of its own
-    number = {name: s for s, name in enumerate(rig.names)}
-    pairs = [(number[image], k) for k, images in enumerate(plan.stations) for image in images]
-    edges = rig.measured(plan.joints, plan.T_base_platform, np.array(pairs))
-    assembled, state = rig.assembled(edges, plan.T_base_platform)
-    info = assembled.problem.linearize(state)
-    assert len(edges.edges) > 5 * 12
-    assert np.unique(edges.edges.station).size == 10
-    assert info is not None
+    assert len({tuple(T[:3, 3].round(6)) for T in rig.T_station_base}) > 5
+    fewer = small(replace(subject, localized=0.5))
+    assert plan.promised.position < fewer.promised.position < 2 * plan.promised.position
+
+
+def test_what_an_image_tells_by_itself():
+    subject = hexapod(1)
+    machine = subject.rig.machine
+    poses, joints = draw_configurations(machine, 4, 0.5, np.random.default_rng(0))
+    work = poses_in(machine.limits(), Region(), 10, 0)
+    info = information_of(subject.rig, Candidates.of_all(((0,),), joints, poses), work)
+    alone, half = info.alone(1.0), info.alone(0.5)
+    none = alone.covariance(alone.information)
+    for k in range(4):
+        one = np.array([k])
+        expected = info.covariance(info.of(one))
+        np.testing.assert_allclose(alone.covariance(alone.of(one)), expected, atol=1e-6)
+        assert np.trace(expected) < np.trace(half.covariance(half.of(one))) < np.trace(none)
 
 
 def test_a_hand_held_session_is_planned_and_rehearsed(demo, quick_plans, tmp_path):

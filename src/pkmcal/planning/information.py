@@ -142,13 +142,15 @@ class CandidateRows:
         whitened = np.linalg.solve(half, (self.machine / scale).T)
         return whitened.T @ whitened
 
-    def alone(self) -> CandidateRows:
+    def alone(self, share: float) -> CandidateRows:
         """Candidates that share no unknowns but the machine's: what each of them tells of it by
         itself, stations, shading and mounts eliminated.
+
+        share : of the candidates that are measured, on average.
         """
         start = np.linalg.inv(self.covariance(self.information))
         each = np.stack([self.covariance(self.of(np.array([k]))) for k in range(len(self.rows))])
-        rows = rows_of_information(np.linalg.inv(each) - start)
+        rows = rows_of_information(share * (np.linalg.inv(each) - start))
         return replace(self, rows=rows, information=start, machine=np.eye(len(start)))
 
     def tool(self, covariance: Array) -> tuple[float, float]:

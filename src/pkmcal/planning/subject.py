@@ -73,6 +73,7 @@ class Subject:
     columns : columns of joints.csv. units : their units, None for SI; empty without any.
     steps : (m,) of which all existing readings of a motor are multiples, m or rad, 0 for none.
     handheld : whether its camera is held by hand; the rig's station stands for all its images.
+    localized : share of hand-held images whose poses are found.
     names : of existing configurations.
     words : sentences on the sources of its numbers.
     board : fields of the board's file, if a board is observed.
@@ -87,6 +88,7 @@ class Subject:
     units: tuple[Unit | None, ...] = ()
     steps: Array | None = None
     handheld: bool = False
+    localized: float = 1.0
 
     __repr__ = short_repr
 
@@ -310,10 +312,16 @@ def _handheld_subject(
     first = replace(by_hand[0], name=by_hand[0].entry)
     rest = replace(session, stations=(first,), trackers=(), links=())
     planned = subject_of_session(rest, saved, anywhere=True, edge=edge, corner=corner, seed=seed)
-    planned = replace(planned, handheld=True)
+    words = "All hand-held images are taken to be localized: an assumption."
+    planned = replace(planned, handheld=True, words=(*planned.words, words))
     localized = set[str]() if saved is None else {station.name for station in saved.stations}
     placed = [station for station in by_hand if station.name in localized]
-    if saved is None or not placed or "legs" not in first.observe:
+    if saved is None or not placed:
+        return planned
+    words = f"As many images are taken to be localized as there: {len(placed)} of {len(by_hand)}."
+    share = len(placed) / len(by_hand)
+    planned = replace(planned, localized=share, words=(*planned.words[:-1], words))
+    if "legs" not in first.observe:
         return planned
     chosen = spread_over(np.arange(len(placed)), most=PLAN_IMAGES_A_STATION)
     known = tuple(placed[k] for k in chosen)
@@ -329,9 +337,9 @@ def _handheld_subject(
         for one in rig.instruments
     )
     shading = measured.estimate.statistics.shading
-    words = f"The accuracy of edges is measured in {len(known)} images that the calibration has."
+    edges = f"The accuracy of edges is measured in {len(known)} images that the calibration has."
     rig = replace(rig, instruments=instruments, shading=shading)
-    return replace(planned, rig=rig, words=(*planned.words[:-1], words))
+    return replace(planned, rig=rig, words=(*planned.words[:-2], edges, words))
 
 
 def _steps(session: Session) -> Array:
