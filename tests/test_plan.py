@@ -468,7 +468,7 @@ def test_two_images_of_each_configuration_by_hand():
     assert plan.promised.position < fewer.promised.position < 2 * plan.promised.position
 
 
-def test_what_an_image_tells_by_itself():
+def test_what_an_image_determines_by_itself():
     subject = hexapod(1)
     machine = subject.rig.machine
     poses, joints = draw_configurations(machine, 4, 0.5, np.random.default_rng(0))

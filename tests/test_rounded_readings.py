@@ -40,7 +40,9 @@ def test_round_readings_are_named_where_they_scatter(tmp_path, following, fact):
     (made.folder / "joints.csv").write_text(csv_text(columns, names, readings.round(9)))
     findings = pkmcal.calibrate(made.folder).findings
     (noise,) = (one for one in findings if one.code.startswith("readings.noise"))
-    assert noise.facts["noise"] > 5e-5
+    true, (low, high) = np.sqrt(np.mean((readings - made.joints) ** 2)), noise.facts["range"]
+    assert low < true / noise.facts["stated"] < high
+    assert noise.facts["noise"] == pytest.approx(true, rel=0.25)
     named = {name: noise.facts.get(name) for name in ("rounded_to", "round_command")}
     assert {k for k, value in named.items() if value} == ({fact} if fact else set())
     if fact:

@@ -262,7 +262,8 @@ def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
     function = inspect.signature(getattr(pkmcal, verb)).parameters
     arguments = {name: one.default for name, one in function.items()}
     if arguments.pop("settings", None):
-        arguments |= {one.name: one.default for one in fields(Settings) if one.name in options}
+        usual = {one.name: one.default for one in fields(Settings) if one.name in options}
+        arguments = usual | arguments
     for name in options.keys() - arguments.keys() - FOR_OUTPUT:
         assert OTHERWISE[name] in arguments or verb == "new"
         if name == "size":

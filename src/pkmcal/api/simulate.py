@@ -108,6 +108,7 @@ def simulate(
     on_platform: bool = False,
     noise: float = default("simulate", "noise"),
     blur: float = default("simulate", "blur"),
+    joint_noise: float | None = None,
     plan: Path | str | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -131,10 +132,11 @@ def simulate(
         Fix the board, the suitable one by default, to the platform instead of the base.
     noise, blur :
         Standard deviations of a pixel's noise, grey levels, and of the lens's blur, px.
+    joint_noise :
+        Standard deviation of a reading, m or rad; by default the plan's, or 3e-6.
     plan :
-        Folder of a plan, whose machine, cameras, stations, configurations and, without
-        ``joint_noise``, noise of a reading are simulated. Configurations that the true machine
-        cannot take are left out, with a finding.
+        Folder of a plan, whose machine, cameras, stations and configurations are simulated.
+        Configurations that the true machine cannot take are left out, with a finding.
     seed :
         Seed for all random numbers.
     progress :
@@ -142,7 +144,7 @@ def simulate(
     settings :
         Further fields of :class:`pkmcal.simulation.Settings`: ``stations=3``,
         ``configurations=15``, ``tolerance=1.0`` (standard deviation of the machine in prior
-        sigmas), ``joint_noise=3e-6``, ``finish="metal"``, ``sensor=`` instead of ``noise`` and
+        sigmas), ``finish="metal"``, ``sensor=`` instead of ``noise`` and
         ``blur``, and so on.
 
     Returns
@@ -159,7 +161,9 @@ def simulate(
 
     """
     given: dict[str, Any] = {"sensor": Sensor(blur=blur, read_noise=noise), **settings}
-    _check_settings({**given, "noise": noise, "blur": blur, "seed": seed})
+    _check_settings(
+        {**given, "noise": noise, "blur": blur, "joint_noise": joint_noise, "seed": seed}
+    )
     planned = None if plan is None else rehearsal_of(plan)
     if planned:
         nominal = planned.machine
@@ -174,9 +178,9 @@ def simulate(
     else:
         fixed = board_for(machine, place) if board or on_platform else None
     given |= {"board": fixed, "board_on": place}
-    if given.get("joint_noise") is None:
-        given["joint_noise"] = planned.joint_noise if planned else GOOD_ENCODER_SIGMA
-    setting = Settings(**given)
+    if joint_noise is None:
+        joint_noise = planned.joint_noise if planned else GOOD_ENCODER_SIGMA
+    setting = Settings(**given, joint_noise=joint_noise)
     eye = planned.cameras if planned else _camera(camera)
     with whole(progress, "Rendering") as report:
         truth = simulate_session(
