@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import chdtr
 
 from conftest import run
 from document_keys import assert_keys
@@ -206,6 +207,31 @@ def test_a_board_in_one_configuration_decides_nothing(h4):
     start = start_state(estimate.machine, one, T_CAMERA_BASE[None])
     with pytest.raises(ResultError, match="too few measurements to predict readings"):
         predict(estimate.machine, one, start)
+
+
+def test_five_images_of_a_board_predict_as_well_as_stated():
+    """The true machine's errors have the stated covariance, from where a free machine's fit ended.
+
+    A platform that does not turn leaves the camera's rotation to a few readings.
+    """
+    rng = np.random.default_rng(0)
+    nominal = load_mechanism("linear-delta")
+    true = true_machine(nominal, 1.0, rng)
+    poses = np.tile(true.home(), (20, 1, 1))
+    poses[:, :3, 3] += rng.uniform(-0.06, 0.06, (20, 3))
+    data = measured(true, poses, rng, noise=0.1).measurements
+    data = replace(data, poses=replace(data.poses, whiten=10 * data.poses.whiten), joint_noise=1e-6)
+    chi2, dof, left_out = 0.0, 0, 0
+    for first in range(0, 20, 5):
+        few = select(data, np.isin(np.arange(20), np.arange(first, first + 5)))
+        start = start_state(nominal, few, T_CAMERA_BASE[None])
+        start = bundle(nominal, few, start).state
+        value = predict(true, few, start)
+        residuals = value.errors.residuals[value.observed]
+        test = promise(residuals, value.noise, np.zeros_like(value.noise))
+        chi2, dof, left_out = chi2 + test.chi2, dof + test.dof, left_out + 5 - len(residuals)
+    assert left_out == 0
+    assert 0.025 < chdtr(dof, chi2) < 0.975
 
 
 # verdicts

@@ -126,6 +126,17 @@ def test_legs_alone_leave_the_size_to_the_tolerance_of_the_scales(name):
     assert 0 < size.moves_platform < 0.0005 / np.sqrt(machine.n_legs) * 0.3
 
 
+def test_the_size_of_a_machine_that_turns_its_arms_needs_a_board():
+    """Angles have no scale, so more configurations never help."""
+    machine = load_mechanism("delta")
+    poses = moved(machine, np.random.default_rng(0), 12)
+    growth = np.where(np.array(machine.parameters.units) == "m", machine.values, 0.0)
+    seen = Situation(machine, np.ones((2, machine.n_legs), dtype=bool), poses)
+    (size,) = describe(seen, growth[None] / np.linalg.norm(growth))
+    assert size.advice.startswith("Observe a board with the legs (observe: [legs, board])")
+    assert "readings" not in size.advice
+
+
 @pytest.mark.parametrize(
     ("name", "legs"),
     [("gough-stewart", "Legs 1 to 6"), ("3-rpr", "Legs 1 to 3"), ("3-rps", "Legs 1 to 3")],

@@ -688,7 +688,7 @@ def _everything(s: Situation) -> NamedChanges:
     columns = np.where(grows, s.machine.values, 0.0)[:, None]
     if not (rows.size and follow):
         text = "the size of everything {is}: all lengths can grow alike"
-        return NamedChanges(s.legs, columns, text)
+        return NamedChanges(s.legs, columns, text, advice="more" if rows.size else "size")
     text = (
         "the size of everything is known from the nominal model only, by the tolerance of the"
         " readings' scales: all lengths can grow alike, and the scales with them"

@@ -220,10 +220,12 @@ def _sizing(around: Situation) -> str:
         return (
             "Measure distances between positions of the tool (distances), which determine the size"
         )
-    return (
-        "Observe a board with the legs (observe: [legs, board]), whose squares determine the size,"
-        " or check the readings over a long way against a measure"
+    board = (
+        "Observe a board with the legs (observe: [legs, board]), whose squares determine the size"
     )
+    if "m" not in around.machine.joint_units:
+        return board
+    return f"{board}, or check the readings over a long way against a measure"
 
 
 def _tying(around: Situation, legs: tuple[int, ...]) -> str:

@@ -118,6 +118,20 @@ class Held:
     state: BatchState
     unknowns: tuple[str, ...]
 
+    def located(self, start: State) -> State:
+        """Stations, boards and observed poses of the solution; the rest is that of ``start``."""
+        poses, internal = start.T_base_platform.copy(), self.state.internal[0]
+        poses[self.observed] = self.state.T_base_platform[0]
+        hinges = np.zeros((len(poses), internal.shape[-1]))
+        hinges[self.observed] = internal
+        return replace(
+            start,
+            T_camera_base=self.state.T_camera_base[0],
+            T_base_platform=poses,
+            T_mount=self.state.T_mount[0],
+            internal=hinges,
+        )
+
     def residuals(self) -> Array:
         """Root mean squares (K,) of each configuration's residuals in standard deviations.
 
@@ -191,7 +205,7 @@ def hold(
     else:
         problem = assembled.trusting(data_weights.weights)
         solution = minimise(problem, begin)
-    if solution.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
+    if solution.stop[0] is not Stop.CONVERGED:
         raise ResultError(
             "the platform's poses were not found with the calibrated machine:"
             f" {solution.stop[0].value}"

@@ -27,7 +27,7 @@ from pkmcal.identify.gauge import pose_generators
 from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.judge.fixed_machine import Held, hold, too_little
-from pkmcal.levels import NEGLIGIBLE, ROUNDING
+from pkmcal.levels import ROUNDING
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine
@@ -40,6 +40,12 @@ SOFT_READING_NOISE = 0.01
 """Standard deviation (m, rad) of readings in the estimate of stations and poses: tens of times the
 uncertainty by an image, so that an observed pose hardly depends on them.
 """
+WIDEST_PREDICTION = 0.1
+"""Largest standard deviation (m, rad) of a predicted reading: beyond it the leave-one-out fit, a
+step of first order, is not valid."""
+LEAST_REDUNDANCY = 1e-4
+"""Smallest eigenvalue of L: its inverse amplifies what the search leaves, 1e-7 of
+SOFT_READING_NOISE, to 10 um."""
 FRAME_LAYING_STEPS = 20
 FRAMES_LAID_CHANGE = 1e-10
 """Change of the frames (m, rad) below which their registration has converged."""
@@ -93,31 +99,35 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
 
     Raises ResultError if the poses cannot be estimated, or if no configuration's pose is observed.
     """
-    # links determine only the difference of two poses
-    soft = replace(measurements, joint_noise=SOFT_READING_NOISE, links=())
-    held = hold(machine, soft, start)
+    # Links determine only the difference of two poses. The fit with the readings' own noise comes
+    # first: from afar, a search with soft readings follows a curved valley.
+    measurements = replace(measurements, links=())
+    near = hold(machine, measurements, start).located(start)
+    held = hold(machine, replace(measurements, joint_noise=SOFT_READING_NOISE), near)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])
     picks = _reading_selector(held, linear.value.shape[-1])
     n, m, n_rows = picks.shape
 
-    # L = E P E^T, the redundancy of each configuration's readings.
+    # L = E P E^T, the redundancy of each configuration's readings, and the predictions' noise.
     along = picks @ own
     along = along @ along.mT
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
     redundancy = np.eye(m) - along - beside @ beside.mT  # L
-    # Below this redundancy the readings themselves determine the pose: its standard deviation by
-    # the observations is ten times SOFT_READING_NOISE.
-    determined = np.linalg.eigvalsh(redundancy).min(axis=-1) >= NEGLIGIBLE
+    determined = np.linalg.eigvalsh(redundancy).min(axis=-1) >= LEAST_REDUNDANCY
+    alone = np.linalg.inv(np.where(determined[:, None, None], redundancy, np.eye(m)))
+    units = _reading_per_sigma(held)[..., None] * alone
+    less = 1 - (measurements.joint_noise / SOFT_READING_NOISE) ** 2
+    noise = _noise(along, beside, units, less)
+    blocks = np.einsum("kikj->kij", noise.reshape(n, m, n, m))
+    determined &= np.linalg.eigvalsh(blocks).max(axis=-1) <= WIDEST_PREDICTION**2
     if not determined.any():
         raise too_little(machine, measurements)
     if not determined.all():
         keep = held.observed.copy()
         keep[held.observed] = determined
         return predict(machine, select(measurements, keep), start)
-    alone = np.linalg.inv(redundancy)
-    units = _reading_per_sigma(held)[..., None] * alone
 
     # Leave-one-out poses, the errors at these, and the derivatives by the fixed machine.
     leave_one_out = _leave_one_out(held, linear, reduced, picks.mT @ alone @ picks)
@@ -126,18 +136,19 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     errors = _errors(
         held.machine, joints, leave_one_out.T_base_platform[0], leave_one_out.internal[0]
     )
+    # to first order at poses that the fixed machine does not reach
+    first_order = (units @ picks @ linear.value[0, ..., None])[..., 0]
+    residuals = np.where(np.isfinite(errors.residuals), errors.residuals, first_order)
     return Prediction(
         machine=held.machine,
         observed=held.observed,
         T_base_platform=_among_all(leave_one_out.T_base_platform[0], held.observed),
         errors=ReadingErrors(
-            _among_all(errors.residuals, held.observed),
+            _among_all(residuals, held.observed),
             _among_all(errors.position, held.observed),
             _among_all(errors.orientation, held.observed),
         ),
-        noise=_noise(
-            along, beside, units, 1 - (measurements.joint_noise / SOFT_READING_NOISE) ** 2
-        ),
+        noise=noise,
         by_machine=(units @ picks @ by).reshape(n * m, -1),
     )
 
