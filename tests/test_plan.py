@@ -400,8 +400,8 @@ def test_a_rehearsal_leaves_out_what_the_true_machine_cannot_take():
     truth = draw_truth(machine, cameras, Settings(stations=1, configurations=4), 0)
     joints = np.concatenate([truth.joints[:1], [[9.0] + [0.5] * 5], truth.joints[1:]])
     pairs = np.stack([np.zeros(5, dtype=int), np.arange(5)], axis=-1)
-    asked = RequestedConfigurations(tuple("abcde"), joints, ("front",), pairs)
-    drawn = draw_truth(machine, cameras, Settings(stations=1, asked=asked), 0)
+    requested = RequestedConfigurations(tuple("abcde"), joints, ("front",), pairs)
+    drawn = draw_truth(machine, cameras, Settings(stations=1, requested=requested), 0)
     assert (drawn.stations, drawn.configurations) == (("front",), tuple("acde"))
     assert drawn.unreachable == ("b",)
     assert drawn.images.tolist() == [[0, 0], [0, 1], [0, 2], [0, 3]]
@@ -456,7 +456,7 @@ def test_a_camera_that_sees_nothing():
 
 def test_two_images_of_each_configuration_by_hand():
     """Each image has its own place; the plan is better than chance, and is what it promises."""
-    subject = replace(hexapod(1), handheld=True)
+    subject = replace(hexapod(1), localized=1.0)
     plan = small(subject)
     assert len(plan.names) == 5
     assert plan.stations == tuple((f"{name}-1", f"{name}-2") for name in plan.names)
@@ -502,7 +502,7 @@ def test_a_hand_held_session_is_planned_and_rehearsed(demo, quick_plans, tmp_pat
         [f"{one['name']}-1", f"{one['name']}-2"] for one in result.json["configurations"]
     ]
     rehearsal = rehearsal_of(session / "plan")
-    settings = Settings(stations=rehearsal.places, asked=rehearsal.requested, handheld=True)
+    settings = Settings(stations=rehearsal.places, requested=rehearsal.requested, handheld=True)
     truth = draw_truth(rehearsal.machine, rehearsal.cameras, settings, 0)
     assert truth.stations == tuple(f"phone-{image}" for image in rehearsal.requested.stations)
     assert len(truth.focal_scale) == 6

@@ -61,7 +61,6 @@ ALLOWED = {
     "seen": "keys of the documents of `check` and `validate`",
     "tells": "a key of the document of `check`",
     "known": "an argument of `pkmcal.compare`",
-    "asked": "an argument of `pkmcal.simulate`",
     "left": "the opposite of right",
     "drawing": "a column of the public table of parameters, and keys of documents",
     "by_drawing": "a key of calibration.json",

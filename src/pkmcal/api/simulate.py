@@ -205,7 +205,7 @@ def _camera(camera: Camera | Path | str | tuple[int, int] | None) -> Camera:
 def _rehearsed(settings: Settings, planned: Rehearsal) -> Settings:
     """Settings with the stations, the configurations and the board of a plan."""
     settings = replace(
-        settings, stations=planned.places, asked=planned.requested, handheld=planned.handheld
+        settings, stations=planned.places, requested=planned.requested, handheld=planned.handheld
     )
     if planned.board is None:
         return settings

@@ -209,8 +209,7 @@ def plan_measurements(
         stations = range(len(rig.names))
         groups = (tuple(stations),) if together else tuple((s,) for s in stations)
         every = Candidates.of_all(groups, *candidates)
-    localized = subject.localized if subject.handheld else None
-    selection = _Selection(rig, subject.prior, groups, count, work, options, localized)
+    selection = _Selection(rig, subject.prior, groups, count, work, options, subject.localized)
     pool = selection.pool(every)
     chosen = selection.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
     progress(0.9)
@@ -255,7 +254,7 @@ class _Pool(NamedTuple):
 class _Selection:
     """Selection of configurations for a rig, with its options.
 
-    handheld : share of images that are localized, where each configuration has images of its own,
+    localized : share of images that are localized, where each configuration has images of its own,
         from places that no other has, and the groups compete for ``count`` configurations in all;
         None where stations are fixed.
     """
@@ -266,24 +265,24 @@ class _Selection:
     count: int
     work: Array
     options: PlanOptions
-    handheld: float | None = None
+    localized: float | None = None
 
     @property
     def n_groups(self) -> int:
         """Number of groups of which each gets its own configurations."""
-        return len(self.groups) if self.handheld is None else 1
+        return len(self.groups) if self.localized is None else 1
 
     def pool(self, candidates: Candidates, rng: np.random.Generator | None = None) -> _Pool:
         """Candidates with their rows. rng : as in :func:`information_of`."""
         rig, work, prior = self.rig, self.work, self.prior
-        if self.handheld is None:
+        if self.localized is None:
             return _Pool(candidates, information_of(rig, candidates, work, prior, rng, self.count))
         infos: list[CandidateRows] = []
         for g in np.unique(candidates.group):
             own = candidates.only(np.flatnonzero(candidates.group == g))
             own = replace(own, groups=((0, 1),), group=np.zeros_like(own.group))
             info = information_of(rig.only(self.groups[g]), own, work, prior, rng, 1)
-            infos.append(info.alone(self.handheld))
+            infos.append(info.alone(self.localized))
         rows, where = ([getattr(info, name) for info in infos] for name in ("rows", "where"))
         group = np.zeros_like(candidates.group)
         whole = replace(
@@ -365,11 +364,11 @@ def _routed_plan(
     rank = np.empty(len(every), dtype=int)
     rank[nested.chosen] = every // n_groups + 1
     places = [selection.groups[g] for g in chosen.group]
-    if selection.handheld is not None:  # one way through all of them
+    if selection.localized is not None:  # one way through all of them
         chosen = replace(chosen, groups=((),), group=np.zeros_like(chosen.group))
     order, blocked, travel = _route(machine, chosen, rng, selection.options)
     names = _new_names(chosen.group[order], subject.names)
-    if selection.handheld is not None:
+    if selection.localized is not None:
         rig, stations = _image_rig(selection.rig, [places[k] for k in order], names)
         subject = replace(subject, rig=rig)
     else:

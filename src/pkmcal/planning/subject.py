@@ -72,8 +72,8 @@ class Subject:
     prior : prior of an earlier calibration.
     columns : columns of joints.csv. units : their units, None for SI; empty without any.
     steps : (m,) of which all existing readings of a motor are multiples, m or rad, 0 for none.
-    handheld : whether its camera is held by hand; the rig's station stands for all its images.
-    localized : share of hand-held images whose poses are found.
+    localized : share of its images that are localized, where its camera is held by hand; the rig's
+        station stands for all of them. None where stations are fixed.
     names : of existing configurations.
     words : sentences on the sources of its numbers.
     board : fields of the board's file, if a board is observed.
@@ -87,10 +87,14 @@ class Subject:
     board: dict[str, Any] | None = None
     units: tuple[Unit | None, ...] = ()
     steps: Array | None = None
-    handheld: bool = False
-    localized: float = 1.0
+    localized: float | None = None
 
     __repr__ = short_repr
+
+    @property
+    def handheld(self) -> bool:
+        """Whether the camera is held by hand."""
+        return self.localized is not None
 
     def commanded(self, joints: Array) -> Array:
         """Readings (n, m) as the machine's controller takes them: multiples of the steps."""
@@ -313,9 +317,9 @@ def _handheld_subject(
     rest = replace(session, stations=(first,), trackers=(), links=())
     planned = subject_of_session(rest, saved, anywhere=True, edge=edge, corner=corner, seed=seed)
     words = "All hand-held images are taken to be localized: an assumption."
-    planned = replace(planned, handheld=True, words=(*planned.words, words))
-    localized = set[str]() if saved is None else {station.name for station in saved.stations}
-    placed = [station for station in by_hand if station.name in localized]
+    planned = replace(planned, localized=1.0, words=(*planned.words, words))
+    names = set[str]() if saved is None else {station.name for station in saved.stations}
+    placed = [station for station in by_hand if station.name in names]
     if saved is None or not placed:
         return planned
     words = f"As many images are taken to be localized as there: {len(placed)} of {len(by_hand)}."

@@ -86,7 +86,7 @@ class Settings:
     shake : standard deviations (m, rad) of the camera's motion between repeats.
     finish, light : of the legs and of the room.
     as_built : whether legs have motors, rings and cables that are not in the nominal model.
-    asked : requested configurations, instead of random ones.
+    requested : requested configurations, instead of random ones.
     handheld : whether each image has a pose of its own around the machine, with ``repeats`` images
         of each configuration and focal lengths with the relative standard deviation ``breathing``;
         a number of ``stations`` is then ignored.
@@ -114,7 +114,7 @@ class Settings:
     handheld: bool = False
     breathing: float = FOCAL_SIGMA
     warming: float = default("simulate", "warming")
-    asked: RequestedConfigurations | None = None
+    requested: RequestedConfigurations | None = None
 
     @property
     def n_stations(self) -> int:
@@ -249,8 +249,8 @@ def draw_truth(
         for T, pose in zip(T_camera_base, poses, strict=True)
     )
     # configurations, board, noise of the readings
-    asked = settings.asked
-    if asked is None:
+    requested = settings.requested
+    if requested is None:
         T_base_platform, joints, images = _configurations(
             nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
         )
@@ -260,9 +260,9 @@ def draw_truth(
             each = enumerate(configurations[k] for k in images[:, 1])
             names = tuple(f"{name}-{s % settings.repeats + 1}" for s, name in each)
     else:
-        taken, T_base_platform, joints, images = _at_requested(nominal, machine, asked)
-        configurations = tuple(compress(asked.names, taken))
-        names, unreachable = asked.stations, tuple(compress(asked.names, ~taken))
+        taken, T_base_platform, joints, images = _at_requested(nominal, machine, requested)
+        configurations = tuple(compress(requested.names, taken))
+        names, unreachable = requested.stations, tuple(compress(requested.names, ~taken))
     board = None
     if settings.board is not None:
         board = place_board(
