@@ -64,6 +64,7 @@ def _another(calibrated: str, text: str) -> InputError:
         found=text,
         expected=calibrated,
         next_step="Give the calibration of this machine, or the session's own nominal model",
+        code="calibration.another_machine",
     )
 
 

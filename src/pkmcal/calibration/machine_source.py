@@ -243,7 +243,10 @@ def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | Non
     if session is not None:
         if not (session / SESSION_FILE).is_file():
             raise InputError(
-                "there is no session here", where=str(session), expected=f"a {SESSION_FILE}"
+                "there is no session here",
+                where=str(session),
+                expected=f"a {SESSION_FILE}",
+                code="session.missing",
             )
         return session
     above = resolved(saved.path).parent.parent

@@ -184,6 +184,7 @@ class SavedCalibration(CalibrationSummary):
                 next_step="An image by hand is no place that a camera is left in"
                 if hand
                 else "Calibrate once more with this pkmcal, or name a station of the calibration",
+                code="calibration.no_covariance",
             )
         where = np.array([self.placed.index(name) for name in names], dtype=int)
         rows = rows_of_stations(len(self.machine.parameters), where)

@@ -420,6 +420,7 @@ def check_enough(
             found=f"{len(used)} of {taken}",
             expected=f"{options.least_views} at least, better ten,"
             " with the board tilted differently",
+            code="lens.too_few_views",
         )
 
 
@@ -496,6 +497,7 @@ def check_determined(
         f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
         next_step="Take images with the board tilted by 20 to 45 degrees, each to another"
         " side, and near the picture's corners",
+        code="lens.focal_unidentifiable",
     )
 
 
@@ -521,6 +523,7 @@ def check_corners(
         expected=f"{options.most_lost:.0%} at most",
         next_step="Look for a bent board, a wrong board file, motion blur, or a zoom or focus that"
         " moved",
+        code="lens.too_many_rejected",
     )
 
 

@@ -177,6 +177,7 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
             where=source.origin,
             next_step="Calibrate again; or export it with --force; its files then"
             " state that it was refused",
+            code="calibration.refused",
         )
     more: list[Finding] = []
     machine = source.machine

@@ -90,7 +90,9 @@ def _raw_blocks(path: Path, label: str, largest: int, block_bytes: int) -> Itera
         ) from None
     except OSError as error:
         reason = error.strerror or type(error).__name__
-        raise InputError(f"the file cannot be read ({reason})", where=label) from None
+        raise InputError(
+            f"the file cannot be read ({reason})", where=label, code="file.unreadable"
+        ) from None
 
 
 def _decoded(raw: bytes, label: str, before: int) -> str:

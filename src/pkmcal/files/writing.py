@@ -100,6 +100,7 @@ def check_own_folder(
             expected=f"a new or empty folder, or {earlier or what.replace('a ', 'an earlier ', 1)}"
             " to replace",
             next_step="Name another folder with -o, or move these files away",
+            code="output.foreign_files",
         )
     return standing
 
@@ -343,4 +344,5 @@ def _unwritable(path: Path, error: OSError) -> InputError:
         f"cannot be written ({error.strerror or error})",
         where=str(path),
         next_step=next_step_after(error),
+        code="file.unwritable",
     )

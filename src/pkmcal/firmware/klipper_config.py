@@ -356,4 +356,5 @@ def _check_saved(text: str, label: str) -> None:
             if marked
             else f"Put '{SAVED_LINE_MARK} ' before it, remove it if it is empty, or move it"
             " above the header; then restart Klipper",
+            code="printer.saved_lines_dropped",
         )

@@ -572,5 +572,7 @@ def _finite_array(values: Array, tail: tuple[int, ...], name: str) -> Array:
             expected=f"(n, {', '.join(map(str, tail))})",
         )
     if not np.isfinite(array).all():
-        raise InputError(what=f"{name} holds a value that is not a finite number")
+        raise InputError(
+            what=f"{name} holds a value that is not a finite number", code="array.not_finite"
+        )
     return array

@@ -379,6 +379,7 @@ def load_session_to_plan(folder: Path | str) -> Session:
             expected="one entry a camera, or a tracker, in one place",
             next_step="Where readings alone are calibrated from, spread the poses over all that the"
             " machine reaches",
+            code="session.no_station",
         )
     return session
 
@@ -462,6 +463,7 @@ def _session_document(folder: Path) -> tuple[Path, Document]:
             where=str(folder),
             found=f"sessions in {listed(below)} below it" if below else None,
             next_step="Name the session's folder; pkmcal new DIR makes one to fill in",
+            code="session.missing",
         )
     document = read_yaml(folder / SESSION_FILE_NAME)
     version = document.data.get("pkmcal", SESSION_FILE_VERSION)
@@ -494,7 +496,10 @@ def _regular_file(folder: Path, document: Document, name: str, keys: Keys) -> Pa
         raise error.located(document.where(*keys)) from None
     except OSError as error:  # e.g. an invalid file name
         raise InputError(
-            f"the file cannot be read ({error.strerror})", where=document.where(*keys), found=name
+            f"the file cannot be read ({error.strerror})",
+            where=document.where(*keys),
+            found=name,
+            code="file.unreadable",
         ) from None
     return path
 

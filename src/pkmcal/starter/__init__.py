@@ -105,6 +105,7 @@ def check_new_folder(folder: Path | str) -> None:
             where=str(folder),
             expected="a new or empty folder",
             next_step="Name another folder; nothing was written into this one",
+            code="output.not_empty",
         )
 
 
