@@ -21,6 +21,7 @@ import pytest
 import pkmcal
 from conftest import run
 from document_keys import assert_keys
+from faults import raises
 from pkmcal.api.calibrate import CalibrationResult
 from pkmcal.api.check import CheckResult
 from pkmcal.boards.board import load_board
@@ -395,8 +396,9 @@ def test_a_new_session_of_any_machine_lacks_its_images_alone(name, tmp_path):
     else:
         in_view = "legs" if drawn.document.legs[0].tubes else "board"
         assert f"observe: {in_view}\n" in text
-        with pytest.raises(InputError, match="there is no image under this pattern"):
+        with raises(InputError, expected="files images/front/{configuration}.png") as caught:
             load_session(folder)
+        assert caught.value.where.endswith("stations.front.images")
         session = load_session(folder, measured=False)
         assert (session.board is None) == (in_view == "legs")
     assert session.machine.n_joints == drawn.n_joints

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field
 
-from faults import fault, written
+from faults import fault, raises, written
 from pkmcal.errors import InputError
 from pkmcal.files import (
     Schema,
@@ -339,12 +339,10 @@ def test_words_for_messages():
 @pytest.mark.parametrize("text", ["1e300", "-2e15", "9" * 300])
 def test_numbers_that_no_quantity_has(tmp_path, text):
     (tmp_path / "a.csv").write_text(f"configuration,x\na,{text}\n")
-    with pytest.raises(InputError, match=r"^a\.csv, line 2, column x: this number is too large"):
+    with raises(InputError, where="a.csv, line 2, column x", expected="at most 1e+15"):
         read_csv(tmp_path / "a.csv")
     (tmp_path / "a.yaml").write_text(f"values:\n  - 1\n  - {text}\n")
-    with pytest.raises(
-        InputError, match=r"^a\.yaml, line 3, values\[2\]: this number is too large"
-    ):
+    with raises(InputError, where="a.yaml, line 3, values[2]", expected="at most 1e+15"):
         validated_document(read_yaml(tmp_path / "a.yaml"), Numbers)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from faults import fault
+from faults import fault, raises
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import pose, pose_difference, rotation
 from pkmcal.session.poses import check_lengths, read_poses
@@ -114,7 +114,7 @@ def test_millimetres(tmp_path):
     T, numbers, _ = whole()
     numbers[:, :3] *= 1000
     value = table(tmp_path, FULL + "\n" + rows(numbers))
-    with pytest.raises(InputError, match="look like millimetres"):
+    with raises(InputError, code="poses.units", where="poses.csv"):
         check_lengths(value, T)
     numbers[:, :3] /= 1000
     check_lengths(table(tmp_path, FULL + "\n" + rows(numbers)), T)

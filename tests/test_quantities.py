@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from faults import fault
+from faults import fault, raises
 from pkmcal.errors import InputError
 from pkmcal.files import Metres, Radians, Reading, Share, read_csv, written_unit
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
@@ -138,5 +138,6 @@ def test_a_tables_heads_name_their_units(tmp_path):
         "holds; found an angle, such as deg, expected a length, such as mm."
     )
     path.write_text("configuration,leg1 [mm],leg1 [m]\na,1,1\n")
-    with pytest.raises(InputError, match="the header names leg1 twice"):
+    with raises(InputError, code="table.column_twice", where="joints.csv, line 1") as caught:
         read_csv(path)
+    assert "leg1" in caught.value.what
