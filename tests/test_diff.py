@@ -12,6 +12,7 @@ import pytest
 
 from conftest import run
 from document_keys import assert_keys
+from faults import raises
 from page_documents import page_blocks, page_document
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
@@ -212,7 +213,7 @@ def test_a_refused_calibration_is_no_base_for_a_comparison(saved):
 
 
 def test_another_machine_is_refused(saved):
-    with pytest.raises(InputError, match=r"two different machines; found delta.*Compare"):
+    with raises(InputError, code="difference.machines", where="delta"):
         difference(saved, "delta")
 
 
