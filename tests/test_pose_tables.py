@@ -105,9 +105,9 @@ def test_faults_are_reported_with_their_place(tmp_path, text, parts):
 
 
 def test_whole_poses_need_the_noise_of_their_turns(tmp_path):
-    message = fault(table, tmp_path, FULL + "\n" + rows(whole()[1]), turn=None)
-    assert "orientations have no stated noise" in message
-    assert "rotation" in message
+    with raises(InputError, code="poses.no_noise") as caught:
+        table(tmp_path, FULL + "\n" + rows(whole()[1]), turn=None)
+    assert "rotation" in caught.value.expected
 
 
 def test_millimetres(tmp_path):

@@ -34,6 +34,7 @@ def session_board_images(folder: Path) -> tuple[list[Path], Path]:
             where=session.where("board"),
             found=schema.board.file,
             expected=wanted_file(board),
+            code="file.missing",
         )
     cameras = sorted({station.camera for station in observers})
     if len(cameras) > 1:
@@ -71,7 +72,9 @@ def image_files(images: Sequence[Path]) -> list[Path]:
         elif path.is_file():
             out.append(path)
         else:
-            raise InputError("there is no such image or folder", where=str(path))
+            raise InputError(
+                "there is no such image or folder", where=str(path), code="file.missing"
+            )
     return list(dict.fromkeys(out))
 
 

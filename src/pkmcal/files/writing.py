@@ -142,7 +142,9 @@ def place_below(folder: Path, name: str) -> Path:
     Raises `InputError` where it would be outside the folder.
     """
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts or not PurePath(name).name:
-        raise InputError("no file can have this name", where=str(folder), found=name)
+        raise InputError(
+            "no file can have this name", where=str(folder), found=name, code="file.impossible_name"
+        )
     return folder / name
 
 

@@ -455,6 +455,7 @@ def _session_document(folder: Path) -> tuple[Path, Document]:
             "there is no such session folder",
             where=str(folder),
             next_step=f"There is {folder.with_name(beside)}" if beside else None,
+            code="session.missing",
         )
     if not (folder / SESSION_FILE_NAME).exists():
         below = sorted(path.parent.name for path in folder.glob(f"*/{SESSION_FILE_NAME}"))
@@ -491,6 +492,7 @@ def _regular_file(folder: Path, document: Document, name: str, keys: Keys) -> Pa
             where=document.where(*keys),
             found=name,
             expected=wanted_file(path),
+            code="file.missing",
         ) from None
     except InputError as error:
         raise error.located(document.where(*keys)) from None
@@ -759,6 +761,7 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
                     where=document.where("stations", station.name, "images"),
                     found=image.path.name,
                     expected="its own images; a station is one camera in one place",
+                    code="station.same_images",
                 )
 
 
@@ -867,6 +870,7 @@ def _unmeasured(
             where=table.label,
             found=table.names[min(measured)],
             expected="two at least; one does not distinguish a joint's place from its offset",
+            code="configurations.only_one",
         )
     missing = [name for row, name in enumerate(table.names) if row not in measured]
     if not missing:
