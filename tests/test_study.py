@@ -433,14 +433,12 @@ def test_more_runs_go_on_from_the_finished_ones(tmp_path, one_process):
 
 def test_another_study_in_the_same_folder_is_refused(tmp_path, one_process):
     study("a", (), runs=4, out=tmp_path)
-    done = run("study", "a", "--vary", "legs=5", "--runs", 4, "-o", tmp_path)
-    assert done.code == 2
-    assert "the batches of another study" in done.err
-    assert "found a, seed 0" in done.err
+    done = run("study", "a", "--vary", "legs=5", "--runs", 4, "-o", tmp_path, "--json")
+    assert (done.code, done.json["code"]) == (2, "study.another")
+    assert done.json["found"].startswith("a, seed 0")
     (tmp_path / "batches" / "study.json").write_text("nonsense")
-    done = run("study", "a", "--runs", 4, "-o", tmp_path)
-    assert done.code == 2
-    assert "does not describe a study" in done.err
+    done = run("study", "a", "--runs", 4, "-o", tmp_path, "--json")
+    assert (done.code, done.json["code"]) == (2, "study.unreadable")
 
 
 def test_a_file_that_is_spoilt_is_done_again(tmp_path, one_process):

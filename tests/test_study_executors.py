@@ -232,14 +232,12 @@ def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, one_process):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     for words in (LONGER, ("a", "--runs", "4")):
-        done = run("study", *words, "-o", tmp_path)
-        assert done.code == 2
-        assert "another study works in this folder. Wait until it has ended" in done.err
+        done = run("study", *words, "-o", tmp_path, "--json")
+        assert (done.code, done.json["code"]) == (2, "output.in_use")
     assert first.poll() is None
     first.kill()
     first.wait()
-    where = f"{tmp_path / 'batches' / 'study.json'}, digest"
-    with raises(InputError, where=where):
+    with raises(InputError, code="study.another"):
         study("a", (), runs=4, out=tmp_path)
     settings = [cell.setting for cell in cells_of(study_subject(), {"configurations": (5, 6)})]
     with Store.opened(tmp_path, "the same", settings, 0) as store:

@@ -585,28 +585,27 @@ def test_the_nominal_model_is_recovered(saved_result, demo):
 
 
 def test_the_same_images(demo, session):
-    done = run("validate", demo.calibration, session)
-    assert done.code == 2
-    assert "the session is not independent" in done.err
-    assert "--holdout N" in done.err
+    done = run("validate", demo.calibration, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "session.not_new")
+    assert "--holdout N" in done.json["next_step"]
     lines = (session / "joints.csv").read_text().splitlines()
     (session / "joints.csv").write_text("\n".join([lines[0], *(line + "1" for line in lines[1:])]))
-    again = run("validate", demo.calibration, session)
-    assert again.err == done.err  # identified by their content, under any names
+    again = run("validate", demo.calibration, session, "--json")
+    assert again.json == done.json  # identified by their content, under any names
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "found"),
     [
-        ("leg", "axis", "have no joint in common; found axis1"),
-        ("leg6", "axis6", "reads other joints than the calibration"),
+        ("leg", "axis", "axis1, axis2, axis3, axis4, axis5 and axis6"),
+        ("leg6", "axis6", "leg1, leg2, leg3, leg4, leg5 and axis6"),
     ],
 )
-def test_sessions_that_do_not_belong(demo, session, old, new, message):
+def test_sessions_that_do_not_belong(demo, session, old, new, found):
     replaced(session / "joints.csv", old, new)
-    done = run("validate", demo.calibration, session)
-    assert done.code == 2
-    assert message in done.err
+    done = run("validate", demo.calibration, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.another_machine")
+    assert (done.json["where"], done.json["found"]) == ("joints.csv, line 1", found)
 
 
 def test_another_machine(demo, session):
@@ -615,22 +614,19 @@ def test_another_machine(demo, session):
     document = read_yaml(session / "mechanism.yaml").data
     document["legs"][2]["base"]["center"][0] += 0.05
     (session / "mechanism.yaml").write_text(yaml_text(document))
-    done = run("validate", demo.calibration, session)
-    assert done.code == 2
-    assert "the calibration is of another machine than the session" in done.err
-    assert "legs[3].base.center.x" in done.err
+    done = run("validate", demo.calibration, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.another_machine")
+    assert "legs[3].base.center.x" in done.json["expected"]
 
 
 def test_an_output_folder_with_other_things(demo, session):
-    done = run("validate", demo.calibration, session, "-o", session)
-    assert done.code == 2
-    assert "the output folder holds something other than a validation" in done.err
+    done = run("validate", demo.calibration, session, "-o", session, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
 
 
 def test_no_calibration_there(session):
-    done = run("validate", session, session)
-    assert done.code == 2
-    assert "there is no calibration here" in done.err
+    done = run("validate", session, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.missing")
 
 
 def test_what_is_advised_where_too_little_was_seen():

@@ -156,6 +156,7 @@ def loaded(origin: Path | str) -> SavedCalibration | Machine:
             expected=closest(str(origin), catalogue())
             or "a folder that pkmcal calibrate wrote, a mechanism file, or"
             f" {listed(sorted(catalogue()), 20)}",
+            code="machine.unknown",
         )
     return load_mechanism(path)
 

@@ -477,6 +477,7 @@ def _read(source: Path) -> Document:
             next_step=f"Name {inside}, the calibration of this session"
             if (inside / CALIBRATION_DOCUMENT_FILE).is_file()
             else None,
+            code="calibration.missing",
         )
     document = read_json(path, label=str(path))
     value = document.data.get(FORMAT_KEY)

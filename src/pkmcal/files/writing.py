@@ -233,6 +233,7 @@ def alone_in(folder: Path, what: str) -> Generator[None]:
                 f"another {what} works in this folder",
                 where=str(folder),
                 next_step="Wait until it has ended, or name another folder with -o",
+                code="output.in_use",
             )
         yield
     finally:

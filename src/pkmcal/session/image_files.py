@@ -194,6 +194,7 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
         f" {pattern.removesuffix(suffix)}{others[0]}"
         if others
         else None,
+        code="images.none",
     )
 
 

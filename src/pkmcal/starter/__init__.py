@@ -144,6 +144,7 @@ def session_texts(
                     if generated
                     else "give the legs of a copy of the nominal model tubes"
                 ),
+                code="session.no_tubes",
             )
         if what is None and not has_tubes:
             what = "readings" if model.redundancy > 0 else "board"

@@ -110,6 +110,7 @@ def subject_of(origin: str) -> StudySubject:
             expected=closest(origin, catalogue())
             or f"a session's folder, a mechanism file, the paper {STUDIED_PAPER}, or"
             f" {listed(sorted(catalogue()), 20)}",
+            code="machine.unknown",
         )
     machine = load_mechanism(origin, label=None)
     check_drawable(machine)
