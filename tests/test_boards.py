@@ -427,7 +427,8 @@ def test_targets_of_kalibr(tmp_path, text, kind, counts):
         assert caught.value.where.endswith(line.partition(":")[0])
     with pytest.raises(InputError) as caught:
         board_of(tmp_path, text.replace("target_type: '", "target_type: 'x"))
-    assert caught.value.what == "no such type of target"
+    assert caught.value.where.endswith("target_type")
+    assert caught.value.found.startswith("x")
 
 
 def test_a_checkerboard_of_kalibr_without_squares(tmp_path):

@@ -409,6 +409,7 @@ def _movement_error(
         expected=_EXPECTED,
         next_step=f"Make the images from {names[after[0]]} on a station of their own, if only"
         " the camera was moved; take them again, if the board was",
+        code="board.not_still",
     )
 
 

@@ -432,6 +432,7 @@ def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
         expected=f"{other.model}, which predicts views left out to {other.left_out:.2g} px"
         if other
         else "images of one flat board by one camera",
+        code="lens.model_misfit",
     )
 
 
@@ -456,6 +457,7 @@ def check_model(
             f"the model {model} does not fit the images",
             found=f"an error of {chosen.left_out:.2g} px on views left out",
             expected=f"{best.model}, with {best.left_out:.2g} px",
+            code="lens.model_misfit",
         )
     return [
         doubtful(
@@ -538,6 +540,7 @@ def check_explained(rms: float, camera: Camera, options: CalibrationCheckOptions
         expected=f"{limit:.2g} px at most, usually a tenth of that",
         next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"
         " images of two cameras",
+        code="lens.no_model_fits",
     )
 
 

@@ -262,6 +262,7 @@ class Machine:
                 expected="a platform that all legs reach",
                 next_step="check the nominal model's centres and ranges, or give home:"
                 " {position: ...}",
+                code="mechanism.not_assembled",
             )
         return fk.T_base_platform[good[0]]
 
@@ -292,6 +293,7 @@ class Machine:
                 found=f"closure error {float(np.max(fk.error)) * 1e3:.3g} mm",
                 expected="readings that the machine can reach",
                 next_step="check the readings, or give a start nearer to the pose",
+                code="readings.unreachable",
             )
         return fk.T_base_platform
 

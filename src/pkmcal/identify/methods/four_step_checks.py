@@ -144,6 +144,7 @@ def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, for
             expected="each leg seen at once with others that fix the platform, [A] 3.5",
             next_step=f"take images of the same configurations from more stations,"
             f" or {USE_JOINT_METHOD}",
+            code="method.legs_apart",
         )
     _needs_poses(legs, visible & posed[:, None])
 
@@ -177,6 +178,7 @@ def _needs_poses(legs: NominalJoints, visible: Booleans) -> None:
                 "legs with a length",
                 expected="two directions at least, with three legs with a length at once, [A] 3.5",
                 next_step=f"add configurations or a station that sees it, or {USE_JOINT_METHOD}",
+                code="method.joint_unidentifiable",
             )
 
 
@@ -240,4 +242,5 @@ def passive_legs_are_fixed(machine: Machine, platform: Array) -> None:
             "on the platform, so its joint could lie anywhere along it",
             expected="two directions at least, [A] 3.5",
             next_step=f"add configurations that tilt or shift the platform, or {USE_JOINT_METHOD}",
+            code="method.leg_one_direction",
         )
