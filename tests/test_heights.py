@@ -438,6 +438,7 @@ def test_saved_lines_that_klipper_would_drop_are_reported(tmp_path, old, new, li
     with raises(InputError, code="printer.saved_lines_dropped", where=where) as error:
         read_printer(text_file(tmp_path, spoilt, "printer.cfg"))
     assert error.value.found.strip("'…") == line
+    assert ("header back" in error.value.next_step) == new.startswith("# <")
 
 
 def test_a_board_on_a_printer(cfg):

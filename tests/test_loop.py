@@ -217,10 +217,6 @@ def test_readings_of_no_pose_stop_it():
         (np.zeros((3, 3)), {"found": "an array of shape (3, 3)"}),
         (np.ones((6, 2, 3)), {"found": "length 1.73205"}),
         (np.full((4, 4), np.nan), {"code": "array.not_finite"}),
-        (
-            perturb(HOME, np.array([0, 0, 0, 0, 0, 0.2])),
-            {"code": "pose.outside_workspace", "expected": "0.345 to 0.485 m"},
-        ),
         (perturb(HOME, np.array([0, 0, np.pi / 2, 0, 0, -0.05])), {"code": "pose.singular"}),
         (GoalImage(np.zeros((480, 640), np.uint8), READINGS), {"code": "servo.no_camera"}),
     ],
@@ -228,6 +224,12 @@ def test_readings_of_no_pose_stop_it():
 def test_goals_that_cannot_be_are_refused(goal, facts):
     with raises(InputError, **facts):
         servo(goal)
+
+
+def test_a_goal_out_of_reach_names_the_motor():
+    with raises(InputError, code="pose.outside_workspace", expected="0.345 to 0.485 m") as caught:
+        servo(perturb(HOME, np.array([0, 0, 0, 0, 0, 0.2])))
+    assert caught.value.what.endswith("leg 1")
 
 
 def test_a_goal_that_a_lesser_machine_cannot_take_is_refused():

@@ -480,8 +480,10 @@ def test_an_image_without_readings(folder):
 def test_an_image_of_another_size(folder):
     image(folder / "images/front/0001.png", 16, 12)
     expected = "8x6 (cameras/front.yaml)"
-    with raises(InputError, where="images/front/0001.png", found="16x12", expected=expected):
+    where = "images/front/0001.png"
+    with raises(InputError, where=where, found="16x12", expected=expected) as caught:
         load_session(folder)
+    assert "unscaled" in caught.value.next_step
 
 
 def test_a_file_that_is_no_image(folder):
