@@ -111,6 +111,7 @@ def _decoded(raw: bytes, label: str, before: int) -> str:
             found=f"byte 0x{raw[error.start]:02x}",
             expected="UTF-8",
             next_step="Save it as UTF-8 in the editor",
+            code="file.not_text",
         ) from None
     if "\0" in text:
         line = before + text.count("\n", 0, text.index("\0")) + 1
@@ -120,6 +121,7 @@ def _decoded(raw: bytes, label: str, before: int) -> str:
             found="a zero byte",
             expected="UTF-8, which has none",
             next_step="Save it as UTF-8 in the editor",
+            code="file.not_text",
         )
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
@@ -252,7 +254,10 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
         ) from None
     except yaml.reader.ReaderError as error:
         raise InputError(
-            "not a text file", where=label, found=f"character #x{error.character:04x}"
+            "not a text file",
+            where=label,
+            found=f"character #x{error.character:04x}",
+            code="file.not_text",
         ) from None
     if not isinstance(data, dict):
         raise InputError(
