@@ -1,4 +1,6 @@
-"""Files with one fault, and the sentence that reports it."""
+"""Files with one fault, and the error that reports it."""
+
+from contextlib import contextmanager
 
 import pytest
 
@@ -23,3 +25,12 @@ def fault(function, *arguments, **keywords):
     with pytest.raises(InputError) as caught:
         function(*arguments, **keywords)
     return str(caught.value)
+
+
+@contextmanager
+def raises(kind, **fields):
+    """`pytest.raises` for an error of pkmcal whose fields, such as code and where, are these."""
+    with pytest.raises(kind) as caught:
+        yield caught
+    raised = {name: getattr(caught.value, name) for name in fields}
+    assert raised == fields, f"{raised} instead of {fields}: {caught.value}"

@@ -8,6 +8,7 @@ test_diagnose.py has the other mistakes of this kind.
 
 from __future__ import annotations
 
+import errno
 import os
 from dataclasses import replace
 
@@ -17,7 +18,7 @@ import pytest
 import yaml
 
 from conftest import run
-from faults import replaced
+from faults import raises, replaced
 from pkmcal.api.calibrate import CalibrationResult
 from pkmcal.errors import InputError
 from pkmcal.session.load import load_session
@@ -270,11 +271,13 @@ def test_no_work_is_spent_before_the_output_is_known_to_be_writable(session, mon
 
 def test_a_disk_that_fills_up_leaves_nothing(session, calibrated, monkeypatch):
     def full(_self, _content):
-        raise OSError(28, "No space left on device")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("pathlib.Path.write_bytes", full)
     result = CalibrationResult.of(replace(calibrated, images={}))
-    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"):
+    where = str(session / "calibration")
+    with raises(InputError, code="file.unwritable", where=where) as caught:
         result.save(session / "calibration")
+    assert os.strerror(errno.ENOSPC) in caught.value.what
     assert not (session / "calibration").exists()
     assert not list(session.glob(".*"))

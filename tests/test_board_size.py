@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.boards.board import PRINTED_SIZE_TOLERANCE, board_from_document
 from pkmcal.boards.poses import pose_set
 from pkmcal.calibration.faults import size_notes
@@ -168,5 +169,5 @@ def test_files_say_how_well_the_size_is_known():
     assert board().tolerance == PRINTED_SIZE_TOLERANCE
     assert board(tolerance=0).tolerance == 0
     assert board(tolerance=2e-4).document["tolerance"] == 2e-4
-    with pytest.raises(InputError, match="tolerance"):
+    with raises(InputError, where="board.yaml, tolerance", found="0.2"):
         board(tolerance=0.2)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of, state_of
@@ -458,11 +459,11 @@ def test_wrong_inputs_are_reported():
     scene = make_scene(rng)
     good = scene.measurements(rng)
     start = scene.state()
-    with pytest.raises(InputError, match="neither an edge nor"):
+    with raises(InputError, code="measurements.none"):
         bundle(scene.machine, replace(good, edges=good.edges.select(np.zeros(0, int))), start)
-    with pytest.raises(InputError, match="5 columns"):
+    with raises(InputError, found="5 columns"):
         bundle(scene.machine, replace(good, joints=good.joints[:, :5]), start)
-    with pytest.raises(InputError, match="does not exist"):
+    with raises(InputError, found="11, 2", expected="below 4, 3"):
         bundle(scene.machine, replace(good, joints=good.joints[:4]), start)
 
 

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from conftest import run
+from faults import raises
 from pkmcal.api.check import CheckResult
 from pkmcal.checks import advice as words
 from pkmcal.checks.check import check_session
@@ -335,7 +336,7 @@ def test_a_check_writes_page_and_pictures(alone_checked, tmp_path):
     # again, over the same; but not beside what is somebody's
     assert result.save_pictures(tmp_path / "drawn")
     (tmp_path / "drawn" / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match="something other than pictures of a check"):
+    with raises(InputError, code="output.foreign_files", found="mine.txt"):
         result.save_pictures(tmp_path / "drawn")
 
 

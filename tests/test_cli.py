@@ -21,6 +21,7 @@ import pytest
 import pkmcal
 from conftest import run
 from document_keys import assert_keys
+from faults import raises
 from pkmcal.api.calibrate import CalibrationResult
 from pkmcal.api.check import CheckResult
 from pkmcal.boards.board import load_board
@@ -320,9 +321,9 @@ def test_a_browser_opens_for_people_only(variables, opens, monkeypatch):
 
 def test_demo_replaces_only_a_demo(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    done = run("demo", "-o", tmp_path, "--fast")
-    assert done.code == 2
-    assert "the folder for the demonstration holds something else; found thesis.tex" in done.err
+    done = run("demo", "-o", tmp_path, "--fast", "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
+    assert done.json["found"] == "thesis.tex"
     assert (tmp_path / "thesis.tex").exists()
 
 
@@ -395,8 +396,9 @@ def test_a_new_session_of_any_machine_lacks_its_images_alone(name, tmp_path):
     else:
         in_view = "legs" if drawn.document.legs[0].tubes else "board"
         assert f"observe: {in_view}\n" in text
-        with pytest.raises(InputError, match="there is no image under this pattern"):
+        with raises(InputError, expected="files images/front/{configuration}.png") as caught:
             load_session(folder)
+        assert caught.value.where.endswith("stations.front.images")
         session = load_session(folder, measured=False)
         assert (session.board is None) == (in_view == "legs")
     assert session.machine.n_joints == drawn.n_joints
@@ -415,9 +417,8 @@ def test_a_new_session_with_a_board_and_places(tmp_path):
     assert "board.yaml is still the example" in " ".join(
         one.text for one in untouched_files(folder)
     )
-    refused = run("new", tmp_path / "delta", "--machine", "delta", "--legs")
-    assert refused.code == 2
-    assert "the nominal model of delta has no cylinders that a camera could see" in refused.err
+    refused = run("new", tmp_path / "delta", "--machine", "delta", "--legs", "--json")
+    assert (refused.code, refused.json["code"]) == (2, "session.no_tubes")
     assert not (tmp_path / "delta").exists()
 
 
@@ -432,9 +433,8 @@ def test_new_asks_on_a_terminal(tmp_path, monkeypatch):
 
 
 def test_new_in_a_folder_that_is_not_empty(demo):
-    done = run("new", demo.session)
-    assert done.code == 2
-    assert "the folder for the new session is not empty" in done.err
+    done = run("new", demo.session, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.not_empty")
 
 
 # check
@@ -579,9 +579,8 @@ def test_an_unusable_result_is_reported_and_written(calibrated, tmp_path, capsys
 
 def test_an_output_folder_with_other_things_is_left_alone(session):
     nominal = (session / "mechanism.yaml").read_bytes()
-    done = run("calibrate", session, "-o", session)
-    assert done.code == 2
-    assert "the output folder holds something other than a calibration" in done.err
+    done = run("calibrate", session, "-o", session, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
     assert (session / "mechanism.yaml").read_bytes() == nominal
 
 
@@ -613,26 +612,22 @@ def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "message"),
+    ("option", "value", "facts"),
     [
-        ("--size", "3x4", "this is not an image size; found 3x4, expected width x height"),
-        ("--size", "large", "found large, expected width x height"),
-        (
-            "--joint-noise",
-            "0",
-            "this number cannot be used; found 0, expected over 0 to 1",
-        ),
-        ("--joint-noise", "nan", "found nan"),
-        ("--mechanism", "gough-stuart", "found gough-stuart, expected gough-stewart"),
-        ("--mechanism", "mine.yaml", "mine.yaml: the file does not exist"),
-        ("--camera", "eye.yaml", "eye.yaml: the file does not exist"),
-        ("--stations", "0", "--stations: this number cannot be used"),
+        ("--size", "3x4", {"where": "--size", "found": "3x4"}),
+        ("--size", "large", {"where": "--size", "found": "large"}),
+        ("--joint-noise", "0", {"where": "--joint-noise", "found": "0"}),
+        ("--joint-noise", "nan", {"where": "--joint-noise", "found": "nan"}),
+        ("--mechanism", "gough-stuart", {"found": "gough-stuart", "expected": "gough-stewart"}),
+        ("--mechanism", "mine.yaml", {"code": "file.missing", "where": "mine.yaml"}),
+        ("--camera", "eye.yaml", {"code": "file.missing", "where": "eye.yaml"}),
+        ("--stations", "0", {"where": "--stations", "found": "0"}),
     ],
 )
-def test_simulate_refuses(tmp_path, option, value, message):
-    done = run("simulate", tmp_path / "s", option, value)
+def test_simulate_refuses(tmp_path, option, value, facts):
+    done = run("simulate", tmp_path / "s", option, value, "--json")
     assert done.code == 2
-    assert message in done.err
+    assert {name: done.json[name] for name in facts} == facts
     assert not (tmp_path / "s").exists()
 
 

@@ -64,33 +64,32 @@ def test_a_sessions_board_images(boards, tmp_path):
     assert done.code == 0, done.err
     text = (folder / "session.yaml").read_text().replace("observe: board", "observe: legs")
     (folder / "session.yaml").write_text(text)
-    refused = run("camera", folder, "-o", tmp_path / "out2")
-    assert refused.code == 2
-    assert "no station of this session observes a board" in refused.err
-    for words, instead, sentence in (
-        ("board: board.yaml", "board: [1, 2]", "session.yaml, line 4, board"),
+    refused = run("camera", folder, "-o", tmp_path / "out2", "--json")
+    assert (refused.code, refused.json["code"]) == (2, "session.no_board")
+    for words, instead, code, where in (
+        ("board: board.yaml", "board: [1, 2]", "error.input", "session.yaml, line 4, board"),
+        ("board: board.yaml", "board: b.yaml", "file.missing", "session.yaml, line 4, board"),
         (
-            "board: board.yaml",
-            "board: b.yaml",
-            "session.yaml, line 4, board: there is no such file",
+            "observe: legs",
+            "observe: ledge",
+            "error.input",
+            "session.yaml, line 6, stations.top.observe",
         ),
-        ("observe: legs", "observe: ledge", "session.yaml, line 6, stations.top.observe"),
     ):
         (folder / "session.yaml").write_text(
             text.replace(words, instead).replace("observe: legs", "observe: board")
         )
-        refused = run("camera", folder, "-o", tmp_path / "out2")
-        assert refused.code == 2
-        assert sentence in refused.err
+        refused = run("camera", folder, "-o", tmp_path / "out2", "--json")
+        assert (refused.code, refused.json["code"]) == (2, code)
+        assert refused.json["where"] == where
 
 
-def test_faults_are_sentences(boards, tmp_path):
+def test_missing_files_are_reported(boards, tmp_path):
     cases = {
-        ("camera", tmp_path / "nowhere"): "there is no such image or folder",
-        ("camera", tmp_path): "the folder holds no images",
-        ("camera", boards, "--board", tmp_path / "b.yaml"): "the file does not exist",
+        ("camera", tmp_path / "nowhere"): ("file.missing", tmp_path / "nowhere"),
+        ("camera", tmp_path): ("images.none", tmp_path),
+        ("camera", boards, "--board", tmp_path / "b.yaml"): ("file.missing", "b.yaml"),
     }
-    for words, sentence in cases.items():
-        done = run(*words, "-o", tmp_path / "out")
-        assert done.code == 2
-        assert sentence in " ".join(done.err.split())
+    for words, (code, where) in cases.items():
+        done = run(*words, "-o", tmp_path / "out", "--json")
+        assert (done.code, done.json["code"], done.json["where"]) == (2, code, str(where))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.control.laws import (
     CONTROL_LAWS,
     direction_interaction,
@@ -280,7 +281,7 @@ def test_matrix_at_the_goal(at):
         for place in (at, "measured")
     ]  # fmt: skip
     np.testing.assert_allclose(*both, atol=1e-9)
-    with pytest.raises(InputError, match="needs the goal's readings"):
+    with raises(InputError, expected="goal_readings, or the interaction as measured"):
         joint_velocities("edges", in_view, n, wanted, joints, 1.0, at=at)
 
 
@@ -366,17 +367,22 @@ def test_a_camera_inside_a_leg_sees_no_edge():
 
 
 @pytest.mark.parametrize(
-    ("name", "legs"),
-    [("gough-stewart", [0, 6]), ("gough-stewart", [1, 1]), ("gough-stewart", []), ("delta", None)],
+    ("name", "legs", "found", "expected"),
+    [
+        ("gough-stewart", [0, 6], "legs 1, 7", "some of 1, 2, 3, 4, 5, 6"),
+        ("gough-stewart", [1, 1], "legs 2, 2", "some of 1, 2, 3, 4, 5, 6"),
+        ("gough-stewart", [], "none", "some of 1, 2, 3, 4, 5, 6"),
+        ("delta", None, "none", "tubes"),
+    ],
 )
-def test_legs_that_cannot_be_seen_are_refused(name, legs):
+def test_legs_that_cannot_be_seen_are_refused(name, legs, found, expected):
     machine = load_mechanism(name)
-    with pytest.raises(InputError, match="needs legs with tubes"):
+    with raises(InputError, found=found, expected=expected):
         machine_view(machine, OUTSIDE, None if legs is None else np.array(legs, dtype=int))
 
 
 def test_unknown_law():
-    with pytest.raises(InputError, match="no such law"):
+    with raises(InputError, found="points", expected="edges or directions"):
         law_named("points")
 
 

@@ -124,7 +124,7 @@ def test_two_columns_exchanged(pair, by_hand, seed):
     error = refusal(pictures(count), readings_with(order, count), by_hand=given(by_hand), seed=seed)
     assert error.code == "readings.exchanged"
     a, b = (COLUMNS[k] for k in pair)
-    assert error.what == f"the readings of {a} and {b} are exchanged"
+    assert f"{a} and {b}" in error.what
 
 
 @pytest.mark.slow
@@ -136,7 +136,7 @@ def test_a_motor_that_counts_the_other_way(motor):
     readings[:, motor] = constant - readings[:, motor]
     error = refusal(pictures(), readings, by_hand=given(True))
     assert error.code == "readings.reversed"
-    assert error.what == f"the readings of {COLUMNS[motor]} count the other way"
+    assert COLUMNS[motor] in error.what
     named = float(re.match(r"(\d+) mm, or nearly so", error.expected)[1])
     assert abs(named - 1e3 * constant) < 10
 

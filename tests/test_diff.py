@@ -12,6 +12,7 @@ import pytest
 
 from conftest import run
 from document_keys import assert_keys
+from faults import raises
 from page_documents import page_blocks, page_document
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
@@ -212,7 +213,7 @@ def test_a_refused_calibration_is_no_base_for_a_comparison(saved):
 
 
 def test_another_machine_is_refused(saved):
-    with pytest.raises(InputError, match=r"two different machines; found delta.*Compare"):
+    with raises(InputError, code="difference.machines", where="delta"):
         difference(saved, "delta")
 
 
@@ -281,18 +282,17 @@ def test_the_command(demo, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("other", "code"),
     [
-        (("gough-stewart", "h5"), "there is no such calibration and no such machine"),
-        (("gough-stewart", "delta"), "delta: these are two different machines"),
-        (("gough-stewart", "."), "there is no calibration here"),
+        ("h5", "machine.unknown"),
+        ("delta", "difference.machines"),
+        (".", "calibration.missing"),
     ],
 )
-def test_what_cannot_be_compared(words, message, tmp_path, monkeypatch):
+def test_what_cannot_be_compared(other, code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    done = run("diff", *words)
-    assert done.code == 2
-    assert message in done.err
+    done = run("diff", "gough-stewart", other, "--json")
+    assert (done.code, done.json["code"]) == (2, code)
     assert not (tmp_path / "diff").exists()
 
 
@@ -320,9 +320,8 @@ def test_an_earlier_difference_is_kept_beside_the_calibration(demo, tmp_path, mo
 
 def test_a_folder_with_other_things_is_left_alone(demo, tmp_path):
     shutil.copytree(demo.calibration, tmp_path / "a")
-    done = run("diff", tmp_path / "a", tmp_path / "a", "-o", tmp_path / "a")
-    assert done.code == 2
-    assert "something other than a difference" in done.err
+    done = run("diff", tmp_path / "a", tmp_path / "a", "-o", tmp_path / "a", "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
 
 
 def test_a_machine_without_a_map_is_compared_all_the_same(tmp_path):

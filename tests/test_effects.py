@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.errors import InputError
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
@@ -123,8 +124,9 @@ def test_a_prior_needs_effects_on_measurements(scene):
         yield Column("test.motion", motion=motion, prior=np.eye(1))
 
     data = replace(scene.measurements(np.random.default_rng(5)), effects=(effect,))
-    with pytest.raises(InputError, match=r"test\.motion"):
+    with raises(InputError, code="effect.prior_of_motion") as caught:
         assemble(scene.machine, data, ThreeCentres())
+    assert "test.motion" in caught.value.what
 
 
 def without_derivatives(prior):

@@ -12,6 +12,7 @@ import yaml
 from conftest import run
 from document_keys import assert_keys
 from export_sources import CAMERA, built, calibration, source_of
+from faults import raises
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.cameras import camera_models, load_camera
 from pkmcal.errors import InputError, ResultError
@@ -42,14 +43,14 @@ EXPRESSED = {
     "ros": (),
 }
 REFUSALS = {
-    "c": "do not fix its platform exactly",
-    "reprap": "RepRapFirmware has settings for deltas",
-    "marlin": "Marlin has settings for",
-    "repetier": "Repetier-Firmware (has settings for|counts end switches in motor steps)",
-    "smoothie": "Smoothieware has settings for",
-    "klipper": "Klipper has settings for deltas",
-    "linuxcnc": "LinuxCNC moves as many joints as coordinates",
-    "ros": "no camera has a pose",
+    "c": {"export.not_determined"},
+    "reprap": {"export.no_delta"},
+    "marlin": {"export.no_delta", "export.no_linear_delta"},
+    "repetier": {"export.no_delta", "export.no_linear_delta", "export.no_steps"},
+    "smoothie": {"export.no_delta", "export.no_linear_delta"},
+    "klipper": {"export.no_delta"},
+    "linuxcnc": {"export.joints_not_coordinates"},
+    "ros": {"export.no_cameras"},
 }
 
 
@@ -63,11 +64,13 @@ def test_every_format_of_the_folder_is_found():
 
 @pytest.mark.parametrize("name", OURS)
 def test_a_format_expresses_a_machine_or_states_that_it_does_not(name):
+    refusals = set()
     for machine in MACHINES:
         source = source_of(load_mechanism(machine))
         if machine not in EXPRESSED[name]:
-            with pytest.raises(InputError, match=REFUSALS[name]):
+            with pytest.raises(InputError) as caught:
                 make_export(source, name)
+            refusals.add(caught.value.code)
             continue
         made = make_export(source, name)
         assert made.differences
@@ -75,6 +78,7 @@ def test_a_format_expresses_a_machine_or_states_that_it_does_not(name):
         for text in made.files.values():
             assert machine in text
             assert "Nominal model only, not calibrated." in text
+    assert refusals == REFUSALS.get(name, set())
 
 
 @pytest.mark.parametrize(
@@ -94,9 +98,8 @@ def test_what_reads_back_otherwise_is_not_written(name, old, new, monkeypatch, t
     spoilt = {key: text.replace(old, new, 1) for key, text in files.items()}
     assert spoilt != files
     monkeypatch.setattr(type(exporter), "files", lambda self, source: spoilt)
-    done = run("export", "gough-stewart", "--to", name, "-o", tmp_path / "out")
-    assert done.code == 1
-    assert "read again, are not the machine" in done.err
+    done = run("export", "gough-stewart", "--to", name, "-o", tmp_path / "out", "--json")
+    assert (done.code, done.json["code"]) == (1, "export.reads_otherwise")
     assert not (tmp_path / "out").exists()
 
 
@@ -126,7 +129,7 @@ def test_samples_need_poses_within_the_ranges():
     values = machine.values.copy()
     names = machine.parameters.names
     values[[k for k, n in enumerate(names) if n.endswith("length.constant")]] = 0.01
-    with pytest.raises(ResultError, match="no poses within its ranges"):
+    with raises(ResultError, code="export.no_workspace"):
         samples(machine.with_values(values))
 
 
@@ -258,41 +261,40 @@ def test_the_command(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "field", "value"),
     [
-        (("h4", "--to", "stl"), "expected c, "),
-        (("h4", "--to", "jsn"), "expected json, or another of c, "),
-        (("h5", "--to", "c"), "there is no such calibration and no such machine"),
-        (("h4",), "Missing option '--to'"),
-        ((".", "--to", "c"), "there is no calibration here"),
-        (("nothing.yaml", "--to", "c"), "does not exist"),
+        (("h4", "--to", "stl"), "expected", "c, "),
+        (("h4", "--to", "jsn"), "expected", "json, or another of c, "),
+        (("h5", "--to", "c"), "code", "machine.unknown"),
+        (("h4",), "what", "Missing option '--to'"),
+        ((".", "--to", "c"), "code", "calibration.missing"),
+        (("nothing.yaml", "--to", "c"), "code", "file.missing"),
     ],
 )
-def test_wrong_words(words, message, tmp_path, monkeypatch):
+def test_wrong_words(words, field, value, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    done = run("export", *words)
+    done = run("export", *words, "--json")
     assert done.code == 2
-    assert message in done.err
+    assert done.json[field].startswith(value)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("all")
-    done = run("export", "h4", "--to", "c", "-o", tmp_path)
-    assert done.code == 2
-    assert "holds something other than this export; found thesis.tex" in done.err
+    done = run("export", "h4", "--to", "c", "-o", tmp_path, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
+    assert done.json["found"] == "thesis.tex"
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_a_refused_calibration_is_refused(tmp_path):
     folder = calibration(tmp_path, built("gough-stewart"), usable=False)
     out = tmp_path / "out"
-    done = run("export", folder, "--to", "c", "-o", out)
-    assert done.code == 1
-    assert "was refused, and is not exported" in done.err
-    assert "The rods cannot be told apart." in done.err
+    done = run("export", folder, "--to", "c", "-o", out, "--json")
+    assert (done.code, done.json["exit_code"]) == (1, 1)
+    assert done.json["code"] == "calibration.refused"
+    assert "The rods cannot be told apart." in done.json["what"]
     assert not out.exists()
-    assert run("export", folder, "--to", "c", "-o", out, "--json").json["exit_code"] == 1
     done = run("export", folder, "--to", "c", "-o", out, "--force")
     assert done.code == 0
     for path in out.iterdir():
@@ -301,9 +303,9 @@ def test_a_refused_calibration_is_refused(tmp_path):
 
 def test_the_session_must_be_one(tmp_path):
     folder = calibration(tmp_path, built("gough-stewart"))
-    done = run("export", folder, "--to", "ros", "--session", tmp_path, "-o", tmp_path / "out")
-    assert done.code == 2
-    assert "there is no session here" in done.err
+    done = run("export", folder, "--to", "ros", "--session", tmp_path, "-o", tmp_path / "out",
+               "--json")  # fmt: skip
+    assert (done.code, done.json["code"]) == (2, "session.missing")
 
 
 # ROS

@@ -11,6 +11,7 @@ import pytest
 
 import pkmcal
 from conftest import run
+from faults import raises
 from mujoco_machines import ALL, LOUD, machine_of
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
@@ -422,7 +423,8 @@ def test_a_urdf_needs_its_loops(tmp_path):
         read(tmp_path / tree, tmp_path)
     assert error.value.found == "leg4_tap"
     (tmp_path / loops).write_text("loops: 3\n")
-    with pytest.raises(InputError, match="loops"):
+    where = f"{tree}: {loops}, line 1, loops"
+    with raises(InputError, where=where, found="3"):
         read(tmp_path / tree, tmp_path)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
 from pkmcal.identify.hand_eye import size_of, solve_pairs, start_from_poses
@@ -180,10 +181,12 @@ def test_a_station_that_nothing_ties_is_reported():
     machine = load_mechanism("gough-stewart")
     body, joints = platform_poses(machine, rng)
     poses = simulated_poses(anywhere(rng, 1.0), body, anywhere(rng, 0.05), rng)
-    with pytest.raises(InputError, match="ties station 2 of 2"):
+    with raises(InputError, code="station.unattached") as caught:
         start_from_poses(machine, measured(poses, joints, 2))
-    with pytest.raises(InputError, match="ties station 1 of 1"):
+    assert "station 2 of 2" in caught.value.what
+    with raises(InputError, code="station.unattached") as caught:
         start_from_poses(machine, measured(poses.select(np.arange(2)), joints))
+    assert "station 1 of 1" in caught.value.what
 
 
 def test_configurations_along_a_line_are_reported():
@@ -191,7 +194,7 @@ def test_configurations_along_a_line_are_reported():
     body = np.broadcast_to(np.eye(4), (12, 4, 4)).copy()
     body[:, 0, 3] = np.linspace(-0.1, 0.1, 12)
     in_view = anywhere(rng, 1.0) @ body @ anywhere(rng, 0.05)
-    with pytest.raises(ResultError, match="do not determine how the camera stands"):
+    with raises(ResultError, code="station.unidentifiable"):
         solve_pairs(body[None], in_view[None], 0.4)
 
 

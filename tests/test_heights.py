@@ -12,6 +12,7 @@ import pytest
 
 import printers
 from conftest import run
+from faults import raises
 from page_documents import page_document
 from pkmcal.boards.board import load_board
 from pkmcal.calibration.calibrate import calibrate_session
@@ -419,24 +420,25 @@ END_A = "#*# position_endstop = 300.0\n"
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "line"),
     [
-        (END_A, "position_endstop = 299.1\n", "found 'position_endstop = 299.1',"),
-        (END_A, "#*#position_endstop = 299.1\n", "found '#*#position_endstop = 299.1',"),
-        ("#*#\n#*# [stepper_b]", "\n#*# [stepper_b]", "remove it if it is empty"),
-        ("#*# <--", "# <--", "Put the header back"),
+        (END_A, "position_endstop = 299.1\n", "position_endstop = 299.1"),
+        (END_A, "#*#position_endstop = 299.1\n", "#*#position_endstop = 299.1"),
+        ("#*#\n#*# [stepper_b]", "\n#*# [stepper_b]", ""),
+        ("#*# <--", "# <--", "#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto"),
     ],
 )
-def test_saved_lines_that_klipper_would_drop_are_reported(tmp_path, old, new, message):
+def test_saved_lines_that_klipper_would_drop_are_reported(tmp_path, old, new, line):
     text = printers.printer_cfg(SAYS)
     spoilt = text.replace(old, new, 1)
     assert spoilt != text
-    with pytest.raises(InputError, match="Klipper drops all that SAVE_CONFIG wrote") as error:
-        read_printer(text_file(tmp_path, spoilt, "printer.cfg"))
-    assert message in str(error.value)
     # for a missing header the following line is reported
     above = spoilt[: spoilt.index(new)].count("\n") + new.startswith("# <")
-    assert f"line {above + 1}:" in str(error.value)
+    where = f"printer.cfg, line {above + 1}"
+    with raises(InputError, code="printer.saved_lines_dropped", where=where) as error:
+        read_printer(text_file(tmp_path, spoilt, "printer.cfg"))
+    assert error.value.found.strip("'…") == line
+    assert ("header back" in error.value.next_step) == new.startswith("# <")
 
 
 def test_a_board_on_a_printer(cfg):
@@ -728,7 +730,7 @@ def test_only_a_bed_is_level(kit, tmp_path):
         (folder / name).write_text((kit / name).read_text())
     rows = "".join(f"{k + 1:03d},0,0,0\n" for k in range(19))
     (folder / "poses.csv").write_text("configuration,x,y,z\n" + rows)
-    with pytest.raises(InputError, match="level applies to heights only"):
+    with raises(InputError, found="columns x, y, z", expected="configuration and z"):
         calibrate_session(folder)
 
 

@@ -9,6 +9,7 @@ import yaml
 import printers
 from conftest import run
 from distance_sessions import stretch
+from faults import raises
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
@@ -87,32 +88,40 @@ def test_a_missing_include_is_named(tmp_path):
     path.write_text("[include towers.cfg]\n" + CFG.replace("delta_radius", "#"))
     with pytest.raises(InputError) as caught:
         read_printer(path)
-    assert "delta_radius" in str(caught.value)
+    assert "delta_radius" in caught.value.what
     assert "towers.cfg" in caught.value.next_step
 
 
 WRONG_INCLUDES = {
-    "itself": ({"printer_cfg": "[include printer.cfg]\n"}, "printer.cfg, line 1"),
+    "itself": (
+        {"printer_cfg": "[include printer.cfg]\n"}, "printer.include_circle",
+        "printer.cfg, line 1"),
     "circle": (
         {"printer_cfg": "[include a.cfg]\n", "a_cfg": "\n[include b.cfg]\n",
-         "b_cfg": "[include ./a.cfg]\n"}, "b.cfg, line 1"),
-    "far": ({"printer_cfg": "[include ../*/*.cfg]\n"}, "printer.cfg, line 1"),
-    "root": ({"printer_cfg": "[include /*]\n"}, "printer.cfg, line 1"),
-    "deep": ({"printer_cfg": "[include */*/*/*]\n"}, "printer.cfg, line 1"),
+         "b_cfg": "[include ./a.cfg]\n"}, "printer.include_circle", "b.cfg, line 1"),
+    "far": (
+        {"printer_cfg": "[include ../*/*.cfg]\n"}, "printer.include_wildcards",
+        "printer.cfg, line 1"),
+    "root": (
+        {"printer_cfg": "[include /*]\n"}, "printer.include_wildcards", "printer.cfg, line 1"),
+    "deep": (
+        {"printer_cfg": "[include */*/*/*]\n"}, "printer.include_wildcards",
+        "printer.cfg, line 1"),
     "twice and twice": (
         {"printer_cfg": "[include b.cfg]\n" * 8, "b_cfg": "[include c.cfg]\n" * 8,
-         "c_cfg": "[x]\n"}, "b.cfg, line "),
-    "folder": ({"printer_cfg": "[include parts]\n", "parts__x_cfg": ""}, "parts"),
-    "no text": ({"printer_cfg": "[include x.cfg]\n", "x_cfg": "\0\1"}, "x.cfg"),
+         "c_cfg": "[x]\n"}, "printer.too_many_includes", "b.cfg, line 1"),
+    "folder": (
+        {"printer_cfg": "[include parts]\n", "parts__x_cfg": ""}, "file.irregular", "parts"),
+    "no text": (
+        {"printer_cfg": "[include x.cfg]\n", "x_cfg": "\0\1"}, "file.not_text", "x.cfg, line 1"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WRONG_INCLUDES)
 def test_includes_that_cannot_be_followed(name, tmp_path):
-    texts, where = WRONG_INCLUDES[name]
-    with pytest.raises(InputError) as caught:
+    texts, code, where = WRONG_INCLUDES[name]
+    with raises(InputError, code=code, where=where):
         read_printer(files(tmp_path, **texts))
-    assert where in str(caught.value)
 
 
 def test_links_in_a_circle_take_no_time(tmp_path):
@@ -379,7 +388,7 @@ def test_distances_that_klipper_saved(tmp_path):
     broken = text.replace("distance3_pos2", "distance3_pos3")
     with pytest.raises(InputError) as caught:
         read_printer(files(tmp_path, printer_cfg=broken))
-    assert "distance3_pos2" in str(caught.value)
+    assert "distance3_pos2" in caught.value.what
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,10 @@ import re
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.control.loop import GoalImage, Status, VisualServo
 from pkmcal.control.machine_view import machine_view, true_edges
-from pkmcal.errors import GeometryError, InputError, PkmcalError
+from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.geometry.rigid import inverse, look_at, perturb, pose_difference
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
@@ -211,56 +212,61 @@ def test_readings_of_no_pose_stop_it():
 
 
 @pytest.mark.parametrize(
-    ("goal", "words"),
+    ("goal", "facts"),
     [
-        (np.zeros((3, 3)), "neither a platform pose nor edges"),
-        (np.ones((6, 2, 3)), "not unit vectors"),
-        (np.full((4, 4), np.nan), "not a finite number"),
-        (perturb(HOME, np.array([0, 0, 0, 0, 0, 0.2])), "out of the machine's reach: leg 1"),
-        (perturb(HOME, np.array([0, 0, np.pi / 2, 0, 0, -0.05])), "nearly singular"),
-        (GoalImage(np.zeros((480, 640), np.uint8), READINGS), "needs the camera"),
+        (np.zeros((3, 3)), {"found": "an array of shape (3, 3)"}),
+        (np.ones((6, 2, 3)), {"found": "length 1.73205"}),
+        (np.full((4, 4), np.nan), {"code": "array.not_finite"}),
+        (perturb(HOME, np.array([0, 0, np.pi / 2, 0, 0, -0.05])), {"code": "pose.singular"}),
+        (GoalImage(np.zeros((480, 640), np.uint8), READINGS), {"code": "servo.no_camera"}),
     ],
 )
-def test_goals_that_cannot_be_are_refused(goal, words):
-    with pytest.raises(InputError, match=words):
+def test_goals_that_cannot_be_are_refused(goal, facts):
+    with raises(InputError, **facts):
         servo(goal)
+
+
+def test_a_goal_out_of_reach_names_the_motor():
+    with raises(InputError, code="pose.outside_workspace", expected="0.345 to 0.485 m") as caught:
+        servo(perturb(HOME, np.array([0, 0, 0, 0, 0, 0.2])))
+    assert caught.value.what.endswith("leg 1")
 
 
 def test_a_goal_that_a_lesser_machine_cannot_take_is_refused():
     machine = load_mechanism("3-rps")
     tilted = perturb(machine.home(), np.array([0, 0, 0, 0.03, 0.02, 0.0]))
-    with pytest.raises(InputError, match="cannot take the goal's pose"):
+    with raises(InputError, code="pose.not_admissible"):
         VisualServo(machine, None, BESIDE, tilted)
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("option", "value", "code", "found"),
     [
-        ({"gain": 0.0}, "gain must be a positive number"),
-        ({"tolerance": np.nan}, "tolerance must be a positive number"),
-        ({"rate_limits": -1.0}, "rate limits must be positive"),
-        ({"law": "faces"}, "no such law"),
-        ({"legs": np.array([7])}, "legs 8|found legs 8"),
+        ("gain", 0.0, "servo.not_positive", "0.0"),
+        ("tolerance", np.nan, "servo.not_positive", "nan"),
+        ("rate_limits", -1.0, "servo.not_positive", str([-1.0] * 6)),
+        ("law", "faces", "error.input", "faces"),
+        ("legs", np.array([7]), "error.input", "legs 8"),
     ],
 )
-def test_options_that_cannot_be_are_refused(options, words):
-    with pytest.raises(InputError, match=words):
-        servo(**options)
+def test_options_that_cannot_be_are_refused(option, value, code, found):
+    with raises(InputError, code=code, found=found) as caught:
+        servo(**{option: value})
+    assert option.replace("_", " ") in caught.value.what
 
 
 def test_samples_that_cannot_be_are_refused():
     loop = servo()
-    with pytest.raises(InputError, match="wrong shape"):
+    with raises(InputError, found="(3, 2, 3)"):
         loop.step_edges(edges()[:3], READINGS)
-    with pytest.raises(InputError, match="unit vectors"):
+    with raises(InputError, found="length 2"):
         loop.step_edges(2 * edges(), READINGS)
-    with pytest.raises(InputError, match="sides exchanged"):
+    with raises(InputError, code="edges.sides_exchanged"):
         loop.step_edges(edges()[:, ::-1], READINGS)
-    with pytest.raises(InputError, match="6 numbers"):
-        loop.step_edges(edges(), READINGS[:5])
-    with pytest.raises(InputError, match="6 numbers"):
-        loop.step_edges(edges(), READINGS * np.nan)
-    with pytest.raises(InputError, match="needs the camera"):
+    for readings in (READINGS[:5], READINGS * np.nan):
+        with raises(InputError, found=str(readings.tolist()), expected="6 numbers, in m or rad"):
+            loop.step_edges(edges(), readings)
+    with raises(InputError, code="servo.no_camera"):
         loop.step_image(np.zeros((480, 640), np.uint8), READINGS)
 
 
@@ -310,9 +316,9 @@ def test_an_image_is_a_goal_and_a_wrong_start_is_stated():
     assert "camera that was moved" in step.sentence
     step = loop.step_image(image, READINGS * [2, 1, 1, 0.2, 1, 1])
     assert step.status is Status.UNREACHABLE
-    with pytest.raises(GeometryError, match="no leg was found in the goal"):
+    with raises(GeometryError, code="servo.goal_not_visible"):
         VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalImage(np.zeros_like(image), READINGS))
-    with pytest.raises(GeometryError, match="no pose of the machine"):
+    with raises(GeometryError, code="readings.unreachable"):
         VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalImage(image, READINGS * [2, 1, 1, 0.2, 1, 1]))
 
 
@@ -330,7 +336,7 @@ def test_a_calibration_gives_machine_camera_and_place(demo):
     np.testing.assert_allclose(inverse(loop.view.T_camera_base), there, atol=1e-12)
     assert loop._sight.edge_shift == saved.document["cameras"][0]["edge_shift"]
     assert loop._sight.binning == saved.document["stations"][0]["binning"]
-    with pytest.raises(InputError, match="no such station"):
+    with raises(InputError, code="calibration.no_station", found="nowhere"):
         VisualServo.from_calibration(demo.calibration, "nowhere", goal)
 
 
@@ -342,8 +348,9 @@ def test_a_refused_calibration_does_not_control(demo, tmp_path):
     document["verdict"]["usable"] = False
     document["verdict"]["reasons"] = ["Too few images."]
     (tmp_path / "calibration.json").write_text(json.dumps(document))
-    with pytest.raises(PkmcalError, match="refused: Too few images"):
+    with raises(ResultError, code="calibration.refused") as caught:
         VisualServo.from_calibration(tmp_path, "station1", HOME)
+    assert "Too few images." in caught.value.what
     (tmp_path / "calibration.json").write_text(text)
-    with pytest.raises(InputError, match="camera file was not found"):
+    with raises(InputError, code="camera.missing", found="station1"):
         VisualServo.from_calibration(tmp_path, "station1", HOME)

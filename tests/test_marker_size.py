@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.boards.detect import detect_boards, marker_share
 from pkmcal.boards.find import detect_board, detect_markers, dictionary
 from pkmcal.errors import InputError
@@ -45,12 +46,10 @@ def test_markers_are_measured_in_images(images, tmp_path):
 
 @pytest.mark.parametrize("marker", [0.015, 0.019, 0.026])
 def test_a_wrong_size_is_reported_with_the_right_one(paths, tmp_path, marker):
-    with pytest.raises(
-        InputError, match="markers have another size than its file states"
-    ) as caught:
+    with raises(InputError, code="board.size") as caught:
         detect_boards(paths, described(tmp_path, marker))
-    assert f"by marker: {marker} and square: 0.03" in str(caught.value)
-    assert "found markers 0.7" in str(caught.value)
+    assert caught.value.expected.endswith(f"by marker: {marker} and square: 0.03")
+    assert caught.value.found.startswith("markers 0.7")
 
 
 @pytest.mark.parametrize("marker", [0.021, 0.022, 0.0235])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from faults import raises
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_refinement import measurements_of
@@ -206,10 +207,10 @@ def test_orientations_alone(folder):
 def test_what_a_tracker_measures_needs_its_own_noise(folder):
     made = make(folder, "3-rps", "orientations", n=5)
     joints = tuple(f"{k:03d}" for k in range(len(made.joints)))
-    with pytest.raises(InputError, match="orientations have no stated noise"):
+    with raises(InputError, code="poses.no_noise", found="columns rx, ry, rz"):
         read_poses(folder / "poses.csv", "poses.csv", joints, POSITION, None)
     write_poses(folder, made.T, "points")
-    with pytest.raises(InputError, match="positions have no stated noise"):
+    with raises(InputError, code="poses.no_noise", found="columns x, y, z"):
         read_poses(folder / "poses.csv", "poses.csv", joints, None, TURN)
 
 
@@ -222,7 +223,7 @@ def test_the_kind_to_come_follows_from_the_stated_noise(position, rotation, kind
 
 
 def test_a_tracker_to_come_without_any_noise(folder):
-    with pytest.raises(InputError, match="no stated noise"):
+    with raises(InputError, code="poses.no_noise", found="neither position nor rotation"):
         PoseTable.to_come("tracker", "poses.csv", None, None)
 
 
@@ -329,8 +330,9 @@ def test_a_target_moved_on_the_platform(folder):
     step = perturb(np.eye(4), np.array([0.01, 0.0, 0.02, 0.002, 0.0, 0.001]))
     in_view[12:] = in_view[12:] @ step
     write_poses(folder, in_view)
-    with pytest.raises(InputError, match="between configuration 011 and 012"):
+    with raises(InputError, code="board.moved") as caught:
         calibrate_session(folder)
+    assert "between configuration 011 and 012" in caught.value.what
 
 
 def test_one_wrong_reading_is_rejected_and_reported(folder):
@@ -415,7 +417,7 @@ def test_a_frozen_reading(folder, name):
     joints = made.joints.copy()
     joints[:, 1] = joints[0, 1]
     write_joints(folder, joints)
-    with pytest.raises(InputError, match="the readings of motor2 are frozen"):
+    with raises(InputError, code="readings.frozen", where="joints.csv, column motor2"):
         calibrate_session(folder)
 
 
@@ -426,7 +428,8 @@ def test_the_sign_of_one_encoder(folder, motor):
     joints = made.joints.copy()
     joints[:, motor] *= -1
     write_joints(folder, joints)
-    with pytest.raises(InputError, match=f"the readings of motor{motor + 1} have the wrong sign"):
+    where = f"joints.csv, line 2, column motor{motor + 1}"
+    with raises(InputError, code="readings.sign", where=where):
         calibrate_session(folder)
     assert "range" in text
 
@@ -453,16 +456,18 @@ def test_a_motor_that_counts_the_other_way(folder, motor):
 def test_two_columns_exchanged(folder):
     made = make(folder, "h4", n=16)
     write_joints(folder, made.joints[:, [1, 0, 2, 3]])
-    with pytest.raises(InputError, match="motor1 and motor2 are exchanged"):
+    with raises(InputError, code="readings.exchanged") as caught:
         calibrate_session(folder)
+    assert "motor1 and motor2" in caught.value.what
 
 
 def test_readings_in_degrees(folder):
     made = make(folder, "h4", n=30)
     write_joints(folder, np.rad2deg(made.joints))
-    with pytest.raises(InputError, match="look like degrees") as caught:
+    with raises(InputError, code="readings.units") as caught:
         load_session(folder)
-    assert "pi/180" in str(caught.value)
+    assert caught.value.expected.startswith("radians")
+    assert "pi/180" in caught.value.next_step
 
 
 def test_lengths_of_another_scale(folder):

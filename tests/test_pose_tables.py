@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from faults import fault
+from faults import fault, raises
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import pose, pose_difference, rotation
 from pkmcal.session.poses import check_lengths, read_poses
@@ -105,16 +105,16 @@ def test_faults_are_reported_with_their_place(tmp_path, text, parts):
 
 
 def test_whole_poses_need_the_noise_of_their_turns(tmp_path):
-    message = fault(table, tmp_path, FULL + "\n" + rows(whole()[1]), turn=None)
-    assert "orientations have no stated noise" in message
-    assert "rotation" in message
+    with raises(InputError, code="poses.no_noise") as caught:
+        table(tmp_path, FULL + "\n" + rows(whole()[1]), turn=None)
+    assert "rotation" in caught.value.expected
 
 
 def test_millimetres(tmp_path):
     T, numbers, _ = whole()
     numbers[:, :3] *= 1000
     value = table(tmp_path, FULL + "\n" + rows(numbers))
-    with pytest.raises(InputError, match="look like millimetres"):
+    with raises(InputError, code="poses.units", where="poses.csv"):
         check_lengths(value, T)
     numbers[:, :3] /= 1000
     check_lengths(table(tmp_path, FULL + "\n" + rows(numbers)), T)

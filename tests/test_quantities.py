@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from faults import fault
+from faults import fault, raises
 from pkmcal.errors import InputError
 from pkmcal.files import Metres, Radians, Reading, Share, read_csv, written_unit
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
@@ -133,10 +133,11 @@ def test_a_tables_heads_name_their_units(tmp_path):
     table = read_csv(path)
     assert table.columns == ("leg1", "leg2", "leg 3", "q [counts]")
     np.testing.assert_allclose(table.values, [[0.2693, math.pi / 6, 1, 7]], rtol=1e-15)
-    assert fault(table.check_kinds, ["m", "m", "m", ""]) == (
-        "joints.csv, line 1, column leg2: this column is in another kind of unit than what it "
-        "holds; found an angle, such as deg, expected a length, such as mm."
-    )
+    where = "joints.csv, line 1, column leg2"
+    found, expected = "an angle, such as deg", "a length, such as mm"
+    with raises(InputError, where=where, found=found, expected=expected):
+        table.check_kinds(["m", "m", "m", ""])
     path.write_text("configuration,leg1 [mm],leg1 [m]\na,1,1\n")
-    with pytest.raises(InputError, match="the header names leg1 twice"):
+    with raises(InputError, code="table.column_twice", where="joints.csv, line 1") as caught:
         read_csv(path)
+    assert "leg1" in caught.value.what

@@ -6,6 +6,7 @@ import pytest
 
 import pkmcal
 from conftest import run
+from faults import raises
 from pkmcal.commands.cli import COMMANDS_IN_ORDER, command_named
 from pkmcal.errors import InputError
 from pkmcal.ranges import RANGES, Range, check_number
@@ -92,16 +93,16 @@ def test_numbers_of_simulate(tmp_path, name, value):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 1e308])
 @pytest.mark.parametrize("name", ["blur", "read_noise"])
 def test_numbers_of_a_sensor(tmp_path, name, value):
-    with pytest.raises(InputError, match="cannot be used"):
+    with raises(InputError, where=f"sensor.{name}", found=f"{value:g}"):
         pkmcal.simulate(tmp_path / "x", "3-rpr", sensor=Sensor(**{name: value}))
 
 
 @pytest.mark.parametrize("value", [np.nan, -1, 10**12, 2.5, "3", True], ids=repr)
 def test_numbers_of_the_other_functions(tmp_path, value):
-    for call in (
-        lambda: pkmcal.calibrate(tmp_path, holdout=value),
-        lambda: pkmcal.plan("3-rpr", count=value),
-        lambda: pkmcal.study("3-rpr", runs=value),
+    for call, where, limits in (
+        (lambda: pkmcal.calibrate(tmp_path, holdout=value), "holdout", "0 to 100000"),
+        (lambda: pkmcal.plan("3-rpr", count=value), "3-rpr: --configurations", "2 to 200"),
+        (lambda: pkmcal.study("3-rpr", runs=value), "runs", "2 to 1e+06"),
     ):
-        with pytest.raises(InputError, match="cannot be used"):
+        with raises(InputError, where=where, expected=f"a whole number, {limits}"):
             call()

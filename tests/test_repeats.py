@@ -11,6 +11,7 @@ import pytest
 
 import pkmcal
 from conftest import FEW_IMPUTATIONS, run
+from faults import raises
 from pkmcal.api.check import CheckResult
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.errors import InputError
@@ -473,15 +474,15 @@ def test_a_shaken_camera_is_reported(tmp_path, checked):
 
 
 def test_a_study_of_repeats_without_repeats_states_what_to_write(demo):
-    with pytest.raises(InputError, match="the session has no repeated images") as caught:
+    with raises(InputError, code="session.no_repeats") as caught:
         study_repeats(demo.session)
-    assert "images/station1/{configuration}_{repeat}.png" in str(caught.value)
-    assert "images/station1/0001_1.png" in str(caught.value)
+    assert caught.value.expected.endswith("images/station1/{configuration}_{repeat}.png")
+    assert "images/station1/0001_1.png" in caught.value.next_step
 
 
 def test_check_repeat_without_repeats_is_refused_before_the_work(demo):
     shares = []
-    with pytest.raises(InputError, match="the session has no repeated images"):
+    with raises(InputError, code="session.no_repeats"):
         pkmcal.check(demo.session, repeat=True, progress=lambda _text, share: shares.append(share))
     assert max(shares) < 0.05
 
@@ -491,10 +492,11 @@ def test_repeats_are_asked_of_cameras_that_stand(demo):
     session = load_session(demo.session)
     first, *rest = session.stations
     by_hand = replace(first, name="by hand/1", handheld=True)
-    with pytest.raises(InputError, match=f"stations.{rest[0].name}.images"):
+    where = f"session.yaml, stations.{rest[0].name}.images"
+    with raises(InputError, code="session.no_repeats", where=where):
         require_repeats(replace(session, stations=(by_hand, *rest)))
     for stations in ((by_hand,), ()):
-        with pytest.raises(InputError, match="no camera that stands in one place"):
+        with raises(InputError, code="session.no_repeats", where="session.yaml, stations"):
             require_repeats(replace(session, stations=stations))
 
 

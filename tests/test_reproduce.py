@@ -174,9 +174,9 @@ def test_refuses(words, reason, tmp_path):
 def test_a_folder_that_cannot_be_written_is_reported_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda *_: pytest.fail("worked"))
     (tmp_path / "file").touch()
-    done = run("reproduce", "-o", tmp_path / "file" / "out")
+    done = run("reproduce", "-o", tmp_path / "file" / "out", "--json")
     assert done.code == 2
-    assert "outputs cannot go here" in done.err
+    assert done.json["found"] == f"{tmp_path / 'file'} is a file"
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, reproduced):
@@ -184,9 +184,9 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, reproduc
         "pkmcal.api.reproduce.reproduce_paper", lambda *_: pytest.fail("worked first")
     )
     (tmp_path / "thesis.tex").write_text("mine")
-    done = run("reproduce", "a", "-o", tmp_path)
-    assert done.code == 2
-    assert "something other than reproductions; found thesis.tex" in done.err
+    done = run("reproduce", "a", "-o", tmp_path, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
+    assert done.json["found"] == "thesis.tex"
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     (tmp_path / "thesis.tex").rename(tmp_path / "paper-c.json")  # an earlier one of another paper
     monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda *_: reproduced)

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from conftest import FEW_IMPUTATIONS
+from faults import raises
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_responses import (
     LEAST_RESPONSE_GAIN,
@@ -145,12 +146,10 @@ def test_what_the_session_states_holds(session):
 
 def test_a_response_that_there_is_not(session):
     stated(session, "log")
-    with pytest.raises(InputError) as caught:
+    with raises(InputError, found="'log'") as caught:
         load_session(session)
-    message = str(caught.value)
-    assert "response" in message
-    assert "log" in message
-    assert "linear" in message
+    assert caught.value.where.endswith("response")
+    assert "linear" in caught.value.expected
 
 
 # detection from edges

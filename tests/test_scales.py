@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from export_sources import built, source_of, with_scales
+from faults import raises
 from pkmcal.calibration.faults import scale_notes
 from pkmcal.calibration.machine_identity import _check_machine
 from pkmcal.calibration.saved_calibration import load
@@ -238,7 +239,7 @@ def test_a_calibration_from_before_scales_has_exact_ones(demo, tmp_path):
     _check_machine(saved, SimpleNamespace(machine=now))
     other = now.with_values(now.values + 0.1)
     table = replace(now.parameters, nominal=other.values)
-    with pytest.raises(InputError, match="another machine"):
+    with raises(InputError, code="calibration.another_machine"):
         _check_machine(saved, SimpleNamespace(machine=replace(other, parameters=table)))
     again = machine_from_document(now.document)
     assert again.parameters.names == now.parameters.names

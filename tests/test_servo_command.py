@@ -77,9 +77,10 @@ def test_a_calibration_with_its_camera(demo, tmp_path):
     assert value["station"] == "station1"
     assert value["estimates"]["identified"]["reached"] >= 2
     assert "calibration's covariance" in value["origin"]
-    other = run("servo", demo.calibration, *QUICK, "--station", "station9", "-o", tmp_path / "two")
-    assert other.code == 2
-    assert "no such station" in other.err
+    other = run("servo", demo.calibration, *QUICK, "--station", "station9", "-o", tmp_path / "two",
+                "--json")  # fmt: skip
+    assert (other.code, other.json["code"]) == (2, "calibration.no_station")
+    assert other.json["found"] == "station9"
 
 
 def test_one_way(tmp_path):
@@ -94,46 +95,52 @@ def test_one_way(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
+    ("options", "where", "found"),
     [
-        (("--law", "points"), "'points' is not one of 'edges', 'directions'"),
-        (("--gain", 0), "--gain: this number cannot be used"),
-        (("--gain", 30, "--delay", 3), "--gain: the loop is unstable"),
-        (("--rate", -5), "--rate: this number cannot be used"),
-        (("--speed", 0), "--speed: this number cannot be used"),
-        (("--duration", 3000), "--duration: the runs would have too many samples"),
-        (("--legs", "1,1"), "--legs: this is not a list of legs; found 1,1"),
-        (("--legs", "x"), "--legs: this is not a list of legs; found x"),
-        (("--legs", "1,2,9"), "needs legs with tubes, each once; found legs 1, 2, 9"),
-        (("--start", "1,2"), "--start: this is not a platform pose; found 1,2"),
-        (("--goal", "0,0,0.6,0,0,0"), "--goal: the pose lies outside of the workspace"),
-        (("--station", "front"), "--station: a machine that is not calibrated has no stations"),
+        (("--gain", 0), "--gain", "0"),
+        (("--gain", 30, "--delay", 3), "--gain", "30/s at 25 samples a second and a delay of 3"),
+        (("--rate", -5), "--rate", "-5"),
+        (("--speed", 0), "--speed", "0"),
+        (("--duration", 3000), "--duration", "75000"),
+        (("--legs", "1,1"), "--legs", "1,1"),
+        (("--legs", "x"), "--legs", "x"),
+        (("--legs", "1,2,9"), None, "legs 1, 2, 9"),
+        (("--start", "1,2"), "--start", "1,2"),
+        (("--goal", "0,0,0.6,0,0,0"), "--goal", "a reading of 0.6334 m for joint 1"),
+        (("--station", "front"), "--station", "front"),
     ],
 )
-def test_wrong_options(tmp_path, options, sentence):
-    done = run("servo", "gough-stewart", "--runs", 2, *options, "-o", tmp_path / "out")
+def test_wrong_options(tmp_path, options, where, found):
+    done = run("servo", "gough-stewart", "--runs", 2, *options, "-o", tmp_path / "out", "--json")
     assert done.code == 2, done.out
-    assert sentence in done.err
+    assert (done.json["where"], done.json["found"]) == (where, found)
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_such_law(tmp_path):
+    done = run("servo", "gough-stewart", "--law", "points", "-o", tmp_path / "out")
+    assert done.code == 2, done.out
+    assert "'points' is not one of 'edges', 'directions'" in done.err
     assert not (tmp_path / "out").exists()
 
 
 def test_no_such_machine(tmp_path):
-    done = run("servo", "nothing", "-o", tmp_path / "out")
-    assert done.code == 2
-    assert "there is no such calibration and no such machine" in done.err
+    done = run("servo", "nothing", "-o", tmp_path / "out", "--json")
+    assert (done.code, done.json["code"]) == (2, "machine.unknown")
+    assert done.json["found"] == "nothing"
 
 
 def test_a_machine_without_tubes(tmp_path):
-    done = run("servo", "delta", "-o", tmp_path / "out")
+    done = run("servo", "delta", "-o", tmp_path / "out", "--json")
     assert done.code == 2
-    assert "needs legs with tubes" in done.err
+    assert (done.json["found"], done.json["expected"]) == ("none", "tubes")
 
 
 def test_foreign_folders_stay(tmp_path):
     folder = tmp_path / "out"
     folder.mkdir()
     (folder / "letter.txt").write_text("mine")
-    done = run("servo", "gough-stewart", "-o", folder)
-    assert done.code == 2
-    assert "something other than a study of servoing" in done.err
+    done = run("servo", "gough-stewart", "-o", folder, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
+    assert done.json["found"] == "letter.txt"
     assert [p.name for p in folder.iterdir()] == ["letter.txt"]

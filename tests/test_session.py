@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from faults import fault, replaced
+from faults import fault, raises, replaced
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
 from pkmcal.session.load import digests, load_session, session_digest
@@ -94,13 +94,16 @@ def test_a_stations_camera_is_read_as_other_programs_write_it(folder, form):
 def test_one_of_several_cameras_is_named_behind_its_file(folder):
     two = OTHERS["kalibr"] + OTHERS["kalibr"].replace("cam0", "cam1").replace("[9, 9", "[10, 10")
     (folder / "cameras" / "front.yaml").write_text(two)
-    assert "Name one behind a #, such as cameras/front.yaml#cam1" in fault(load_session, folder)
+    with raises(InputError, code="camera.several", found="cam0 and cam1") as caught:
+        load_session(folder)
+    assert "cameras/front.yaml#cam1" in caught.value.next_step
     replaced(folder / "session.yaml", "front.yaml", "front.yaml#cam1")
     (front,) = load_session(folder).stations
     assert front.camera.parameters[0] == 10
     assert front.camera_file == "cameras/front.yaml#cam1"
     replaced(folder / "session.yaml", "front.yaml#cam1", "front.yaml#cam7")
-    assert "no such camera; found cam7, expected cam0 and cam1" in fault(load_session, folder)
+    with raises(InputError, found="cam7", expected="cam0 and cam1"):
+        load_session(folder)
 
 
 def test_a_session(folder):
@@ -350,16 +353,19 @@ def test_a_wrong_line(folder, name, old, new, parts):
 
 
 def test_no_such_folder(tmp_path):
-    assert "there is no such session folder" in fault(load_session, tmp_path / "none")
+    with raises(InputError, code="session.missing", where=str(tmp_path / "none")):
+        load_session(tmp_path / "none")
 
 
 def test_a_folder_without_session(folder):
     inner = folder / "runs" / "monday"
     inner.mkdir(parents=True)
     (folder / "session.yaml").rename(inner / "session.yaml")
-    message = fault(load_session, folder / "runs")
-    assert "the folder holds no session.yaml; found sessions in monday below it" in message
-    assert "pkmcal new DIR" in fault(load_session, folder)
+    with raises(InputError, code="session.missing", found="sessions in monday below it"):
+        load_session(folder / "runs")
+    with raises(InputError, code="session.missing", found=None) as caught:
+        load_session(folder)
+    assert "pkmcal new DIR" in caught.value.next_step
 
 
 def scaled(factor):
@@ -383,7 +389,8 @@ def test_motors_in_degrees(folder):
     of range.
     """
     (folder / "joints.csv").write_text(scaled(180 / np.pi))
-    assert "this reading is outside the machine's range" in fault(load_session, folder)
+    with raises(InputError, code="readings.outside_range", found="20.6265"):
+        load_session(folder)
     table = read_csv(folder / "joints.csv", label="joints.csv")
     ranges = np.tile([0.345, 0.485], (len(table.columns), 1))
     with pytest.raises(InputError) as caught:
@@ -404,18 +411,20 @@ def shifted(by, columns=range(6)):
 def test_one_constant_that_explains_all_readings_is_reported(folder):
     """0.345 to 0.485, 7 mm to spare; readings are from 0.35 to 0.46."""
     (folder / "joints.csv").write_text(shifted(-0.34))
-    message = fault(load_session, folder)
-    assert message.startswith("joints.csv, line 2, column leg1: the readings of leg1, leg2, leg3,")
-    assert "leg6 are off by one constant" in message
-    assert "found 0.02, expected 0.345 to 0.485" in message
-    assert "one number between +328 and +372 mm added" in message
+    where = "joints.csv, line 2, column leg1"
+    with raises(InputError, code="readings.zero", where=where, found="0.02") as caught:
+        load_session(folder)
+    assert "leg1, leg2, leg3, leg4, leg5 and leg6" in caught.value.what
+    assert caught.value.expected.startswith("0.345 to 0.485, ")
+    assert "between +328 and +372 mm" in caught.value.expected
 
 
 def test_one_constant_of_one_joint_is_reported(folder):
     (folder / "joints.csv").write_text(shifted(0.2, [2]))
-    message = fault(load_session, folder)
-    assert "column leg3: the readings of leg3 are off by one constant" in message
-    assert f"between {MINUS_SIGN}242 and {MINUS_SIGN}148 mm added" in message
+    with raises(InputError, code="readings.zero") as caught:
+        load_session(folder)
+    assert caught.value.where.endswith("column leg3")
+    assert f"between {MINUS_SIGN}242 and {MINUS_SIGN}148 mm" in caught.value.expected
 
 
 def test_two_joints_with_two_constants_are_out_of_range(folder):
@@ -424,67 +433,77 @@ def test_two_joints_with_two_constants_are_out_of_range(folder):
     cells = [row.split(",") for row in rows]
     other = "\n".join(",".join([*c[:4], f"{float(c[4]) - 0.2:.4f}", *c[5:]]) for c in cells)
     (folder / "joints.csv").write_text(f"{header}\n{other}\n")
-    assert "this reading is outside the machine's range" in fault(load_session, folder)
+    with raises(InputError, code="readings.outside_range", found="0.58"):
+        load_session(folder)
 
 
 def test_one_reading_in_millimetres_is_a_mistake_of_its_own(folder):
     replaced(folder / "joints.csv", "0.37", "370")
-    assert "line 2, column leg2: this reading is outside" in fault(load_session, folder)
+    where = "joints.csv, line 2, column leg2"
+    with raises(InputError, code="readings.outside_range", where=where, found="370"):
+        load_session(folder)
 
 
 def test_more_readings_out_of_range_are_counted(folder):
     replaced(folder / "joints.csv", "0.36,0.37", "0.96,0.97")
-    assert "It is one of 2 such readings. Correct" in fault(load_session, folder)
+    with raises(InputError, code="readings.outside_range", found="0.96") as caught:
+        load_session(folder)
+    assert "one of 2 such readings" in caught.value.next_step
 
 
 def test_all_configurations_alike(folder):
     header, row, *_ = JOINTS.splitlines()
     rows = [row, row.replace("0000", "0001").replace("0.36", "0.360001"), row.replace("0000", "2")]
     (folder / "joints.csv").write_text("\n".join([header, *rows]))
-    message = fault(load_session, folder)
-    assert "joints.csv: all configurations are equal: no joint moves by more than its" in message
-    assert "joints.noise, 3e-06" in message
+    with raises(InputError, code="readings.unmoved", where="joints.csv") as caught:
+        load_session(folder)
+    assert caught.value.expected.endswith("joints.noise, 3e-06")
 
 
 def test_only_one_configuration_imaged(folder):
     for name in ("0001", "0002"):
         (folder / f"images/front/{name}.png").unlink()
-    assert "only one configuration has images; found 0000" in fault(load_session, folder)
+    with raises(InputError, code="configurations.only_one", found="0000"):
+        load_session(folder)
 
 
 def test_an_image_without_readings(folder):
     image(folder / "images/front/0003.png")
     image(folder / "images/front/0004.png")
-    message = fault(load_session, folder)
-    assert "images/front/0003.png is of a configuration without joint readings" in message
-    assert "(one of 2 such files)" in message
-    assert "expected one of the table's 3: 0000, 0001 and 0002" in message
+    expected = "one of the table's 3: 0000, 0001 and 0002"
+    with raises(InputError, found="configuration 0003", expected=expected) as caught:
+        load_session(folder)
+    assert "images/front/0003.png" in caught.value.what
+    assert "one of 2 such files" in caught.value.what
 
 
 def test_an_image_of_another_size(folder):
     image(folder / "images/front/0001.png", 16, 12)
-    message = fault(load_session, folder)
-    assert "images/front/0001.png: the image has another size than its camera" in message
-    assert "found 16x12, expected 8x6 (cameras/front.yaml)" in message
-    assert "unscaled" in message
+    expected = "8x6 (cameras/front.yaml)"
+    where = "images/front/0001.png"
+    with raises(InputError, where=where, found="16x12", expected=expected) as caught:
+        load_session(folder)
+    assert "unscaled" in caught.value.next_step
 
 
 def test_a_file_that_is_no_image(folder):
     (folder / "images/front/0001.png").write_bytes(b"")
-    assert fault(load_session, folder).startswith("images/front/0001.png: the image file is empty")
+    with raises(InputError, code="image.empty", where="images/front/0001.png"):
+        load_session(folder)
 
 
 def test_one_stations_images_under_two_names(folder):
     station = SESSION[SESSION.index("  front:") :]
     with (folder / "session.yaml").open("a") as stream:
         stream.write(station.replace("  front:", "  left:"))
-    message = fault(load_session, folder)
-    assert "stations.left.images: station left has the images of station front" in message
+    with raises(InputError, code="station.same_images", found="0000.png") as caught:
+        load_session(folder)
+    assert caught.value.where.endswith("stations.left.images")
 
 
 def test_images_of_another_ending_are_reported(folder):
     for path in (folder / "images" / "front").iterdir():
         path.rename(path.with_suffix(".JPG"))
-    assert "Images there end in .JPG: write images/front/{configuration}.JPG." in fault(
-        load_session, folder
-    )
+    with raises(InputError, expected="files images/front/{configuration}.png") as caught:
+        load_session(folder)
+    assert "images/front/{configuration}.JPG" in caught.value.next_step

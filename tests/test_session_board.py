@@ -6,7 +6,8 @@ import json
 
 import pytest
 
-from faults import fault, replaced
+from faults import fault, raises, replaced
+from pkmcal.errors import InputError
 from pkmcal.session.load import load_session
 from test_session import folder, image
 
@@ -82,4 +83,5 @@ def test_a_wrong_board(joined, old, new, parts):
 def test_a_board_on_the_base_and_no_legs(joined):
     replaced(joined / "session.yaml", "observe: [legs, board]", "observe: board")
     replaced(joined / "session.yaml", "observe: [board, legs]", "observe: board")
-    assert "which does not move, and no station observes legs" in fault(load_session, joined)
+    with raises(InputError, found="board", expected="[legs, board], in the same images"):
+        load_session(joined)

@@ -493,9 +493,8 @@ def test_another_page_with_the_bundle_is_left_alone(tmp_path):
     page = tmp_path / "report.html"
     page.write_text(f"<script>{bundle_file('viewer.js')}</script>")
     before = page.read_bytes()
-    done = run("show", "3-rpr", "-o", page)
-    assert done.code == 2
-    assert "not a page of the viewer" in done.err
+    done = run("show", "3-rpr", "-o", page, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
     assert page.read_bytes() == before
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.control.laws import task_of
 from pkmcal.control.machine_view import legs_at, machine_view, true_edges
 from pkmcal.control.track import (
@@ -156,16 +157,16 @@ def test_readings_that_close_no_machine_are_no_edges(view):
 
 
 @pytest.mark.parametrize(
-    ("image", "words"),
+    ("image", "found"),
     [
-        (np.zeros((480, 640, 3), np.uint8), "grey levels"),
-        (np.zeros((480, 640)), "float64"),
-        (np.zeros((240, 320), np.uint8), "320x240"),
+        (np.zeros((480, 640, 3), np.uint8), "uint8 of shape (480, 640, 3)"),
+        (np.zeros((480, 640)), "float64 of shape (480, 640)"),
+        (np.zeros((240, 320), np.uint8), "320x240 pixels"),
     ],
 )
-def test_images_that_are_none_are_named(image, words):
+def test_images_that_are_none_are_named(image, found):
     sight = Sight(machine_view(MACHINE, BESIDE), PERSPECTIVE)
-    with pytest.raises(InputError, match=words):
+    with raises(InputError, found=found):
         track(sight, first_track_state(sight.view), image, READINGS)
 
 

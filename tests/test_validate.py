@@ -14,7 +14,7 @@ from scipy.special import chdtr
 
 from conftest import run
 from document_keys import assert_keys
-from faults import replaced
+from faults import raises, replaced
 from page_documents import page_blocks, page_document, page_text
 from pkmcal.calibration.holdout import (
     by_region,
@@ -205,7 +205,7 @@ def test_a_board_in_one_configuration_decides_nothing(h4):
     _, _, estimate, case, _ = h4
     one = select(case.measurements, np.arange(71) == 0)
     start = start_state(estimate.machine, one, T_CAMERA_BASE[None])
-    with pytest.raises(ResultError, match="too few measurements to predict readings"):
+    with raises(ResultError, code="validation.few_measurements"):
         predict(estimate.machine, one, start)
 
 
@@ -442,14 +442,14 @@ def test_poor_extrapolation_is_reported(hexapod):
 @pytest.mark.parametrize("n", [0, 13, 24])
 def test_how_many_to_hold_out(hexapod, n):
     nominal, _, estimate, data = hexapod
-    with pytest.raises(InputError, match=r"configurations held out is not possible.*1 to 12, for"):
+    with raises(InputError, found=str(n), expected="1 to 12, for 24 poses seen"):
         chosen(nominal, estimate, data, n)
 
 
 def test_too_few_configurations_to_hold_out(hexapod):
     nominal, _, estimate, data = hexapod
     few = SimpleNamespace(configurations=np.arange(24) < 3, state=estimate.state)
-    with pytest.raises(InputError, match="too few configurations to hold any out"):
+    with raises(InputError, found="3 poses seen"):
         chosen(nominal, few, data, 1)
 
 
@@ -476,7 +476,7 @@ def test_a_pose_under_several_names_is_held_out_whole(hexapod):
     assert sum(len(region.rows) for region in count) == 66
     for region in count:
         assert set(np.unique(region.rows % 22, return_counts=True)[1]) == {3}
-    with pytest.raises(InputError, match=r"found 12, expected 1 to 11, for 22 poses seen"):
+    with raises(InputError, found="12", expected="1 to 11, for 22 poses seen"):
         chosen(nominal, whole, again, 12)
 
 
@@ -611,28 +611,27 @@ def test_the_nominal_model_is_recovered(saved_result, demo):
 
 
 def test_the_same_images(demo, session):
-    done = run("validate", demo.calibration, session)
-    assert done.code == 2
-    assert "the session is not independent" in done.err
-    assert "--holdout N" in done.err
+    done = run("validate", demo.calibration, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "session.not_new")
+    assert "--holdout N" in done.json["next_step"]
     lines = (session / "joints.csv").read_text().splitlines()
     (session / "joints.csv").write_text("\n".join([lines[0], *(line + "1" for line in lines[1:])]))
-    again = run("validate", demo.calibration, session)
-    assert again.err == done.err  # identified by their content, under any names
+    again = run("validate", demo.calibration, session, "--json")
+    assert again.json == done.json  # identified by their content, under any names
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "found"),
     [
-        ("leg", "axis", "have no joint in common; found axis1"),
-        ("leg6", "axis6", "reads other joints than the calibration"),
+        ("leg", "axis", "axis1, axis2, axis3, axis4, axis5 and axis6"),
+        ("leg6", "axis6", "leg1, leg2, leg3, leg4, leg5 and axis6"),
     ],
 )
-def test_sessions_that_do_not_belong(demo, session, old, new, message):
+def test_sessions_that_do_not_belong(demo, session, old, new, found):
     replaced(session / "joints.csv", old, new)
-    done = run("validate", demo.calibration, session)
-    assert done.code == 2
-    assert message in done.err
+    done = run("validate", demo.calibration, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.another_machine")
+    assert (done.json["where"], done.json["found"]) == ("joints.csv, line 1", found)
 
 
 def test_another_machine(demo, session):
@@ -641,22 +640,19 @@ def test_another_machine(demo, session):
     document = read_yaml(session / "mechanism.yaml").data
     document["legs"][2]["base"]["center"][0] += 0.05
     (session / "mechanism.yaml").write_text(yaml_text(document))
-    done = run("validate", demo.calibration, session)
-    assert done.code == 2
-    assert "the calibration is of another machine than the session" in done.err
-    assert "legs[3].base.center.x" in done.err
+    done = run("validate", demo.calibration, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.another_machine")
+    assert "legs[3].base.center.x" in done.json["expected"]
 
 
 def test_an_output_folder_with_other_things(demo, session):
-    done = run("validate", demo.calibration, session, "-o", session)
-    assert done.code == 2
-    assert "the output folder holds something other than a validation" in done.err
+    done = run("validate", demo.calibration, session, "-o", session, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
 
 
 def test_no_calibration_there(session):
-    done = run("validate", session, session)
-    assert done.code == 2
-    assert "there is no calibration here" in done.err
+    done = run("validate", session, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.missing")
 
 
 def test_what_is_advised_where_too_little_was_seen():

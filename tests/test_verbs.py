@@ -17,6 +17,7 @@ import pytest
 
 import pkmcal
 from conftest import have_cores, run
+from faults import raises
 from pkmcal.api.result import FolderResult, Result, printed_document
 from pkmcal.commands.cli import command_named
 from pkmcal.errors import InputError
@@ -291,9 +292,9 @@ def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
 
 def test_a_simulated_session_is_not_copied_into_itself(tmp_path):
     made = pkmcal.simulate(tmp_path / "s", "3-rpr", camera=(64, 48), stations=1, configurations=2)
-    with pytest.raises(InputError, match="not copied into itself"):
+    with raises(InputError, code="output.inside_session"):
         made.save(tmp_path / "s" / "copy")
-    with pytest.raises(InputError, match="not empty"):
+    with raises(InputError, code="output.not_empty"):
         made.save(tmp_path)
     made.save(tmp_path / "copy")
     assert (tmp_path / "copy" / "truth.json").is_file()

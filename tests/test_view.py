@@ -185,7 +185,8 @@ def test_faults_are_reported_in_words(page, session):
     broken.write_bytes(broken.read_bytes()[:-40])
     answer = Page(session).get("image/0/0")
     assert answer.status == 422
-    assert answer.json()["message"].startswith(f"{broken.relative_to(session)}: the image")
+    assert answer.json()["code"] == "image.damaged"
+    assert answer.json()["where"] == broken.relative_to(session).as_posix()
     assert page.get("image/0/99").json()["found"] == "100"
     for body, words in (
         ({"station": 9}, "there is no such station"),
@@ -593,8 +594,8 @@ def test_what_cannot_be_shown_is_reported_before(demo, session, tmp_path):
         done = run("view", demo.session, "--port", port)
     assert done.code == 2
     assert done.err.startswith(f"Error: --port: the page cannot be served on port {port}")
-    done = run("view", demo.session, "--calibration", tmp_path)
-    assert (done.code, "there is no calibration of this session" in done.err) == (2, True)
+    done = run("view", demo.session, "--calibration", tmp_path, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.missing")
     assert run("view", tmp_path / "nowhere").code == 2
     names = load_session(session).configurations
     rows = [f"{name},0,0,0.3{k},1,0,0,0" for k, name in enumerate(names)]
@@ -602,8 +603,8 @@ def test_what_cannot_be_shown_is_reported_before(demo, session, tmp_path):
     text = (session / "session.yaml").read_text().partition("stations:")[0]
     tracker = "{poses: poses.csv, noise: {position: 1.0e-5, rotation: 1.0e-5}}"
     (session / "session.yaml").write_text(f"{text}stations: {{t: {{tracker: {tracker}}}}}\n")
-    done = run("view", session)
-    assert (done.code, "there are no images to be shown" in done.err) == (2, True)
+    done = run("view", session, "--json")
+    assert (done.code, done.json["code"]) == (2, "images.none")
 
 
 # ------------------------------------------------------------------ the stage

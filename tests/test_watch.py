@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
@@ -507,7 +508,7 @@ def test_poses_that_cannot_be_found(watched, monkeypatch):
     start = start_state(watched.true, data, watched.pool.T_camera_base)
     module = "pkmcal.judge.fixed_machine.minimise"
     monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,), None))
-    with pytest.raises(ResultError, match="poses were not found with the calibrated machine"):
+    with raises(ResultError, code="poses.not_converged"):
         hold(watched.true, data, start, Trust.full(data))
 
 

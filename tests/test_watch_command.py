@@ -207,10 +207,10 @@ def test_a_history_that_cannot_be_read_is_refused_before_the_work(
     (folder / "watch.json").write_text(json.dumps({"runs": [RUN]}))
     assert len(WatchResult.check_folder(folder)) == 1
     (folder / "watch.json").write_text(json.dumps({"runs": [{**RUN, **change}]}))
-    done = run("watch", demo.calibration, later.same, "-o", folder)
+    done = run("watch", demo.calibration, later.same, "-o", folder, "--json")
     assert done.code == 2
-    assert "watch.json" in done.err
-    assert place in done.err
+    assert "watch.json" in done.json["where"]
+    assert place in done.json["message"]
 
 
 def test_configurations_that_the_calibration_used_are_left_out(demo, later, calibration):
@@ -235,10 +235,9 @@ def test_configurations_that_the_calibration_used_are_left_out(demo, later, cali
 
 
 def test_the_calibrations_own_session(demo, session):
-    done = run("watch", demo.calibration, session)
-    assert done.code == 2
-    assert "there is nothing new in this session" in done.err
-    assert "Take five or more new images" in done.err
+    done = run("watch", demo.calibration, session, "--json")
+    assert (done.code, done.json["code"]) == (2, "session.not_new")
+    assert "new images" in done.json["next_step"]
 
 
 def test_a_calibration_that_was_refused(again, calibration):
@@ -246,39 +245,34 @@ def test_a_calibration_that_was_refused(again, calibration):
         document["verdict"] |= {"usable": False, "reasons": ["The lens is not this camera's."]}
 
     spoiled(calibration, refused)
-    done = run("watch", calibration, again)
-    assert done.code == 2
-    assert "this calibration should not be used" in done.err
-    assert "The lens is not this camera's" in done.err
+    done = run("watch", calibration, again, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.refused")
+    assert done.json["found"] == "The lens is not this camera's."
 
 
 def test_another_machine(demo, again):
     other = load_mechanism(again / "mechanism.yaml")
     far = changed(other, "legs[3].base.center.x", 0.05)
     (again / "mechanism.yaml").write_text(mechanism_text(far))
-    done = run("watch", demo.calibration, again)
-    assert done.code == 2
-    assert "the calibration is of another machine than the session" in done.err
+    done = run("watch", demo.calibration, again, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.another_machine")
 
 
 @pytest.mark.parametrize("alpha", ["0", "0.5", "nan"])
 def test_a_share_of_false_alarms_that_makes_no_sense(demo, again, alpha):
-    done = run("watch", demo.calibration, again, "--alpha", alpha)
-    assert done.code == 2
-    assert "--alpha: this number cannot be used" in done.err
-    assert "0.2" in done.err
+    done = run("watch", demo.calibration, again, "--alpha", alpha, "--json")
+    assert (done.code, done.json["where"], done.json["found"]) == (2, "--alpha", alpha)
+    assert "0.2" in done.json["expected"]
 
 
 def test_an_output_folder_with_other_things(demo, again):
-    done = run("watch", demo.calibration, again, "-o", again)
-    assert done.code == 2
-    assert "the output folder holds something other than what watch writes" in done.err
+    done = run("watch", demo.calibration, again, "-o", again, "--json")
+    assert (done.code, done.json["code"]) == (2, "output.foreign_files")
 
 
 def test_no_calibration_there(again):
-    done = run("watch", again, again)
-    assert done.code == 2
-    assert "there is no calibration here" in done.err
+    done = run("watch", again, again, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.missing")
 
 
 # a camera that was left in place
@@ -348,13 +342,11 @@ def test_a_camera_that_stands_elsewhere_is_reported(demo, later, stayed, tmp_pat
 
 
 def test_a_station_that_is_none(demo, again, stayed, calibration):
-    done = run("watch", demo.calibration, again, "--same-place", "attic")
-    assert done.code == 2
-    assert "--same-place: the session has no station of this name; found attic" in done.err
+    done = run("watch", demo.calibration, again, "--same-place", "attic", "--json")
+    assert (done.code, done.json["where"], done.json["found"]) == (2, "--same-place", "attic")
     spoiled(calibration, lambda document: document.pop("station_covariance"))
-    done = run("watch", calibration, again, "--same-place", stayed.name)
-    assert done.code == 2
-    assert "Calibrate once more" in done.err
+    done = run("watch", calibration, again, "--same-place", stayed.name, "--json")
+    assert (done.code, done.json["code"]) == (2, "calibration.no_covariance")
 
 
 # the lens

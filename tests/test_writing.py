@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from faults import fault
+from faults import raises
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.files import (
@@ -53,7 +53,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    assert "No space left" in fault(write_bytes, tmp_path / "a", b"new")
+    with raises(InputError, code="file.unwritable", where=str(tmp_path / "a")):
+        write_bytes(tmp_path / "a", b"new")
     assert (tmp_path / "a").read_bytes() == b"old"
     assert everything_in(tmp_path) == ["a"]
 
@@ -66,7 +67,8 @@ def test_check_writable_leaves_no_trace(tmp_path):
 
 def test_outputs_cannot_go_below_a_file(tmp_path):
     (tmp_path / "out").touch()
-    assert f"{tmp_path / 'out'} is a file" in fault(check_writable, tmp_path / "out" / "deeper")
+    with raises(InputError, found=f"{tmp_path / 'out'} is a file", expected="a folder"):
+        check_writable(tmp_path / "out" / "deeper")
 
 
 def test_a_folder_that_refuses(tmp_path, monkeypatch):
@@ -74,9 +76,9 @@ def test_a_folder_that_refuses(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    message = fault(check_writable, tmp_path / "out")
-    assert "cannot be written (Permission denied)" in message
-    assert "Change the permissions" in message
+    with raises(InputError, code="file.unwritable", where=str(tmp_path / "out")) as caught:
+        check_writable(tmp_path / "out")
+    assert "permissions" in caught.value.next_step
 
 
 def test_a_new_folder_appears_at_once(tmp_path):
@@ -123,7 +125,9 @@ def test_a_clash_is_noticed_before_anything_is_moved(tmp_path):
             (stage / "a").write_text("1")
             (stage / "b").write_text("2")
 
-    assert "a folder stands where a file should go" in fault(work)
+    with raises(InputError, code="file.unwritable", where=str(tmp_path)) as caught:
+        work()
+    assert "a folder stands where a file should go" in caught.value.what
     assert everything_in(tmp_path) == ["b"]
 
 
@@ -386,7 +390,8 @@ def interrupted(tmp_path, monkeypatch):
 
 
 def test_a_replacement_cut_short_is_finished_by_the_next_that_writes_there(interrupted):
-    assert COMMITTED_FOLDER in fault(read_text, interrupted / "a")
+    with raises(InputError, found=COMMITTED_FOLDER):
+        read_text(interrupted / "a")
     assert entries(interrupted) == ["a", "c", "d", "sub"]
     assert texts_of(interrupted) == NEW
 
@@ -397,7 +402,9 @@ def test_a_replacement_cut_short_again_is_finished_all_the_same(interrupted, mon
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "replace", refuse)
-        assert "cannot be moved to their place (Permission denied)" in fault(entries, interrupted)
+        found = f"the rest of them in {COMMITTED_FOLDER}"
+        with raises(InputError, code="file.unwritable", found=found):
+            entries(interrupted)
     entries(interrupted)
     assert texts_of(interrupted) == NEW
 
@@ -407,13 +414,15 @@ def left_alone(folder):
     report it.
     """
     before = contents_of(folder.parent)
-    refused = [
-        fault(read_text, folder / "a"),
-        fault(entries, folder),
-        fault(write_folder, folder, {"a": "newer"}),
-    ]
+    for refused in (
+        lambda: read_text(folder / "a"),
+        lambda: entries(folder),
+        lambda: write_folder(folder, {"a": "newer"}),
+    ):
+        with raises(InputError, found=COMMITTED_FOLDER):
+            refused()
     after = {k: v for k, v in contents_of(folder.parent).items() if not k.startswith("cache/")}
-    return all(COMMITTED_FOLDER in text for text in refused) and after.items() <= before.items()
+    return after.items() <= before.items()
 
 
 def moved(folder):
@@ -476,7 +485,8 @@ def test_where_no_key_can_be_kept_files_are_replaced_all_the_same(tmp_path, monk
     write_folder(tmp_path / "out", NEW, over=["b"])
     assert texts_of(tmp_path / "out") == NEW
     cut_short(tmp_path / "again", monkeypatch)
-    assert COMMITTED_FOLDER in fault(entries, tmp_path / "again")
+    with raises(InputError, found=COMMITTED_FOLDER):
+        entries(tmp_path / "again")
 
 
 def test_a_reader_waits_for_who_moves_files(interrupted):
@@ -501,9 +511,9 @@ def test_no_file_goes_through_a_link_in_an_output(tmp_path):
     (tmp_path / "home").mkdir()
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "sub").symlink_to(tmp_path / "home")
-    assert "a link stands where a folder should go" in fault(
-        write_folder, tmp_path / "out", {"a": "1", "sub/b": "1"}
-    )
+    with raises(InputError, code="file.unwritable", where=str(tmp_path / "out")) as caught:
+        write_folder(tmp_path / "out", {"a": "1", "sub/b": "1"})
+    assert "a link stands where a folder should go" in caught.value.what
     assert everything_in(tmp_path) == ["home", "out", "out/sub"]
 
 
@@ -521,14 +531,16 @@ def test_a_link_in_a_files_place_is_replaced_and_not_followed(tmp_path):
 
 @pytest.mark.parametrize("name", ["../a", "sub/../../a", "/a", "", "."])
 def test_no_name_leads_out_of_an_output(tmp_path, name):
-    assert "no file can have this name" in fault(write_folder, tmp_path / "out", {name: "1"})
+    with raises(InputError, code="file.impossible_name", found=name):
+        write_folder(tmp_path / "out", {name: "1"})
     assert everything_in(tmp_path) == []
 
 
 def test_an_output_that_nobody_named_is_no_link(tmp_path):
     (tmp_path / "home").mkdir()
     (tmp_path / "calibration").symlink_to(tmp_path / "home")
-    assert "Name the folder to write to with -o" in fault(default_output, tmp_path / "calibration")
+    with raises(InputError, found=f"a link to {tmp_path / 'home'}"):
+        default_output(tmp_path / "calibration")
     assert default_output(tmp_path / "home") == tmp_path / "home"
     write_folder(tmp_path / "calibration", {"a": "1"})  # one that is named may be a link
     assert everything_in(tmp_path / "home") == ["a"]
@@ -536,8 +548,10 @@ def test_an_output_that_nobody_named_is_no_link(tmp_path):
 
 @pytest.mark.parametrize("there", ["itself", "nothing"])
 def test_an_output_that_links_to_nothing_is_refused_before_the_work(tmp_path, there):
-    (tmp_path / "out").symlink_to("out" if there == "itself" else "nothing")
-    assert "a link to what is not there" in fault(check_writable, tmp_path / "out" / "deeper")
+    target = "out" if there == "itself" else "nothing"
+    (tmp_path / "out").symlink_to(target)
+    with raises(InputError, where=str(tmp_path / "out"), found=target, expected="a folder"):
+        check_writable(tmp_path / "out" / "deeper")
 
 
 @pytest.mark.parametrize(

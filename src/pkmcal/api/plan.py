@@ -205,4 +205,9 @@ def _check_options(owner: str, given: Mapping[str, object]) -> None:
     """Raise `InputError` for options that do not apply to this subject."""
     for name, value in given.items():
         if value:
-            raise InputError(f"this option is for {owner}", where=name, next_step="Leave it out")
+            raise InputError(
+                f"this option is for {owner}",
+                where=name,
+                next_step="Leave it out",
+                code="option.not_applicable",
+            )

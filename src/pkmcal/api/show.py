@@ -74,6 +74,7 @@ class MachineView:
                 "the file exists and is not a page of the viewer, so it was not replaced",
                 where=str(path),
                 next_step="Name another file with -o",
+                code="output.foreign_files",
             )
         write_text(path, self.html)
 

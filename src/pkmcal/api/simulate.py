@@ -81,6 +81,7 @@ class SimulationResult(Session, Result):
                 "a session is not copied into itself",
                 where=str(folder),
                 next_step="Name a folder beside it",
+                code="output.inside_session",
             )
         with staged_folder(folder) as stage:
             shutil.copytree(self.folder, stage, dirs_exist_ok=True)

@@ -195,6 +195,7 @@ def check_boards(
                 found=other,
                 expected=f"{board.described}, as in {listed([f.name for f in with_board], 3)}",
                 next_step="Calibrate with the images of one board",
+                code="board.mixed",
             )
         if other is not None:
             out[k] = replace(out[k], reason=f"it shows {other}; {out[k].reason}")
@@ -211,6 +212,7 @@ def check_any(detections: Sequence[Detection], board: Board) -> None:
             expected=board.described,
             next_step="Check the board file, the light and the focus; a chessboard's white border"
             " must be seen as well",
+            code="board.not_found",
         )
 
 

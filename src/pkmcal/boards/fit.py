@@ -329,6 +329,7 @@ def check_numbering(
         found=f"{int(wrong.sum())} of {len(wrong)} corners at other ones' places",
         expected=board.described,
         next_step="Check the numbers of rows and columns, the first marker's id and the dictionary",
+        code="board.numbering",
     )
 
 

@@ -235,6 +235,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
             where="board.yaml",
             found=board.described,
             expected="an odd and an even number of corners, or a board with markers (charuco)",
+            code="board.ambiguous",
         )
     mirrored = [detection.name for detection in detections if detection.mirrored]
     others = sum(detection.success and not detection.mirrored for detection in detections)
@@ -246,6 +247,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
             found=f"the board's markers reversed, and not in {count(others, 'other image')}",
             next_step=f"Flip {'this image' if one else 'these images'} alone, or take"
             f" {'it' if one else 'them'} again",
+            code="image.mirrored",
         )
     if mirrored:
         raise InputError(
@@ -253,6 +255,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
             where=listed(mirrored, 3),
             expected="images in which the board's markers are not reversed",
             next_step="Flip all images of this camera, and calibrate the camera from flipped ones",
+            code="image.mirrored",
         )
 
 
@@ -270,6 +273,7 @@ def _check_explained(views: BoardViews) -> None:
         found=f"{np.median(views.rms):.2g} px rms off their places ({views.board.described})",
         expected=f"{limit:.2g} px at most, usually a hundredth of that",
         next_step="Look for a wrong board file, a bent board, or another camera's file",
+        code="board.contradicted",
     )
 
 
@@ -382,6 +386,7 @@ def _check_still(views: BoardViews, there: Array, agreed: Booleans) -> None:
             where=views.names[0].rpartition("/")[0] or views.names[0],
             found=f"{odd} of {len(used)} images show it in other places than the rest",
             expected=_EXPECTED,
+            code="board.not_still",
         )
 
 
@@ -404,6 +409,7 @@ def _movement_error(
         expected=_EXPECTED,
         next_step=f"Make the images from {names[after[0]]} on a station of their own, if only"
         " the camera was moved; take them again, if the board was",
+        code="board.not_still",
     )
 
 

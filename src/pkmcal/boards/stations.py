@@ -97,6 +97,7 @@ def _check_visible(name: str, board: Board, detections: Sequence[Detection]) -> 
             expected=f"{board.described}, sharp, and not hidden by the machine",
             next_step="Check the board file, the light and the focus, or write observe: legs for"
             " this station",
+            code="board.not_found",
         )
 
 

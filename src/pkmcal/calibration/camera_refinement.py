@@ -161,6 +161,7 @@ def refinement_of(session: Session, refine: bool) -> CameraRefinement:
             "no station has a camera whose intrinsics could be refined",
             where="session.yaml, stations",
             next_step="Leave --refine-camera out",
+            code="camera.none_to_refine",
         )
     roots = [
         covariance_root(camera)

@@ -64,6 +64,7 @@ def _another(calibrated: str, text: str) -> InputError:
         found=text,
         expected=calibrated,
         next_step="Give the calibration of this machine, or the session's own nominal model",
+        code="calibration.another_machine",
     )
 
 
@@ -81,6 +82,7 @@ def _check_joints(saved: SavedCalibration, session: Session) -> None:
         found=listed(new, 8),
         expected=listed(old, 8),
         next_step="Give the calibration of this machine, with the columns in the same order",
+        code="calibration.another_machine",
     )
 
 

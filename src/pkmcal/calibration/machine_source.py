@@ -156,6 +156,7 @@ def loaded(origin: Path | str) -> SavedCalibration | Machine:
             expected=closest(str(origin), catalogue())
             or "a folder that pkmcal calibrate wrote, a mechanism file, or"
             f" {listed(sorted(catalogue()), 20)}",
+            code="machine.unknown",
         )
     return load_mechanism(path)
 
@@ -243,7 +244,10 @@ def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | Non
     if session is not None:
         if not (session / SESSION_FILE).is_file():
             raise InputError(
-                "there is no session here", where=str(session), expected=f"a {SESSION_FILE}"
+                "there is no session here",
+                where=str(session),
+                expected=f"a {SESSION_FILE}",
+                code="session.missing",
             )
         return session
     above = resolved(saved.path).parent.parent

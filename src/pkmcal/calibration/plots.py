@@ -33,7 +33,9 @@ def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
     try:
         from matplotlib import pyplot
     except ImportError:
-        raise InputError("plots need matplotlib", next_step=install_step("plot")) from None
+        raise InputError(
+            "plots need matplotlib", next_step=install_step("plot"), code="package.missing"
+        ) from None
     return pyplot.subplots(figsize=size, layout="constrained")[1]
 
 

@@ -583,6 +583,7 @@ def _feasible_start(session: Session, measurements: Measurements, start: State) 
             found=f"a gap of {float(fk.error.max()) * 1e3:.3g} mm",
             expected="readings at which all legs reach the platform",
             next_step="Check these readings, or leave these configurations out",
+            code="readings.unreachable",
         )
     return replace(estimate.state, T_base_platform=fk.T_base_platform, internal=fk.internal)
 

@@ -96,6 +96,7 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
             found=listed(foreign or standing, 4),
             expected="a new or empty folder, or one of an earlier calibration",
             next_step="Name another folder with -o, or move these files away",
+            code="output.foreign_files",
         )
     if standing and not force:
         try:
@@ -106,6 +107,7 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
                 " its folder",
                 where=str(folder),
                 next_step="Name another folder with -o, or replace it with --force",
+                code="output.earlier_not_kept",
             ) from None
     return standing
 

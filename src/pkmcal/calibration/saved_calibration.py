@@ -184,6 +184,7 @@ class SavedCalibration(CalibrationSummary):
                 next_step="An image by hand is no place that a camera is left in"
                 if hand
                 else "Calibrate once more with this pkmcal, or name a station of the calibration",
+                code="calibration.no_covariance",
             )
         where = np.array([self.placed.index(name) for name in names], dtype=int)
         rows = rows_of_stations(len(self.machine.parameters), where)
@@ -476,6 +477,7 @@ def _read(source: Path) -> Document:
             next_step=f"Name {inside}, the calibration of this session"
             if (inside / CALIBRATION_DOCUMENT_FILE).is_file()
             else None,
+            code="calibration.missing",
         )
     document = read_json(path, label=str(path))
     value = document.data.get(FORMAT_KEY)

@@ -420,6 +420,7 @@ def check_enough(
             found=f"{len(used)} of {taken}",
             expected=f"{options.least_views} at least, better ten,"
             " with the board tilted differently",
+            code="lens.too_few_views",
         )
 
 
@@ -431,6 +432,7 @@ def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
         expected=f"{other.model}, which predicts views left out to {other.left_out:.2g} px"
         if other
         else "images of one flat board by one camera",
+        code="lens.model_misfit",
     )
 
 
@@ -455,6 +457,7 @@ def check_model(
             f"the model {model} does not fit the images",
             found=f"an error of {chosen.left_out:.2g} px on views left out",
             expected=f"{best.model}, with {best.left_out:.2g} px",
+            code="lens.model_misfit",
         )
     return [
         doubtful(
@@ -496,6 +499,7 @@ def check_determined(
         f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
         next_step="Take images with the board tilted by 20 to 45 degrees, each to another"
         " side, and near the picture's corners",
+        code="lens.focal_unidentifiable",
     )
 
 
@@ -521,6 +525,7 @@ def check_corners(
         expected=f"{options.most_lost:.0%} at most",
         next_step="Look for a bent board, a wrong board file, motion blur, or a zoom or focus that"
         " moved",
+        code="lens.too_many_rejected",
     )
 
 
@@ -535,6 +540,7 @@ def check_explained(rms: float, camera: Camera, options: CalibrationCheckOptions
         expected=f"{limit:.2g} px at most, usually a tenth of that",
         next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"
         " images of two cameras",
+        code="lens.no_model_fits",
     )
 
 

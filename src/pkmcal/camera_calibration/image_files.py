@@ -26,6 +26,7 @@ def session_board_images(folder: Path) -> tuple[list[Path], Path]:
             where=session.where("stations"),
             expected="observe: board on a station, and board: board.yaml",
             next_step="Name the board's images instead: pkmcal camera IMAGES... --board FILE",
+            code="session.no_board",
         )
     board = folder / schema.board.file
     if not board.exists():
@@ -34,6 +35,7 @@ def session_board_images(folder: Path) -> tuple[list[Path], Path]:
             where=session.where("board"),
             found=schema.board.file,
             expected=wanted_file(board),
+            code="file.missing",
         )
     cameras = sorted({station.camera for station in observers})
     if len(cameras) > 1:
@@ -48,7 +50,9 @@ def session_board_images(folder: Path) -> tuple[list[Path], Path]:
     wild = [p.replace("{configuration}", "*").replace("{repeat}", "*") for p in patterns]
     paths = sorted({folder / name for text in wild for name in glob.glob(text, root_dir=folder)})
     if not paths:
-        raise InputError("no images found", where=session.where("stations"), found=wild[0])
+        raise InputError(
+            "no images found", where=session.where("stations"), found=wild[0], code="images.none"
+        )
     return paths, board
 
 
@@ -66,12 +70,15 @@ def image_files(images: Sequence[Path]) -> list[Path]:
                     where=str(path),
                     expected=f"some in it ({', '.join(sorted(IMAGE_FILE_ENDINGS))}), or a"
                     " session.yaml that names them",
+                    code="images.none",
                 )
             out += inside
         elif path.is_file():
             out.append(path)
         else:
-            raise InputError("there is no such image or folder", where=str(path))
+            raise InputError(
+                "there is no such image or folder", where=str(path), code="file.missing"
+            )
     return list(dict.fromkeys(out))
 
 

@@ -502,12 +502,14 @@ def _kalibr_data(camera: Camera) -> dict[str, Any]:
             f"Kalibr has no {camera.model} camera",
             expected=listed(list(_KALIBR_NAMES)),
             next_step="Write it for OpenCV, or calibrate with another model",
+            code="camera.not_in_format",
         )
     if any(k[4:]):
         raise InputError(
             "Kalibr's radtan distortion has no third radial term",
             found=f"k3 = {k[4]:g}",
             next_step="Calibrate without k3, or write the camera for OpenCV or ROS",
+            code="camera.not_in_format",
         )
     four = [parameters[name] for name in ("focal.x", "focal.y", "center.x", "center.y")]
     model, distortion = _KALIBR_NAMES[camera.model]

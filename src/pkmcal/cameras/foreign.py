@@ -47,6 +47,7 @@ def named_entry(entries: Mapping[str, Entry], name: str | None, label: str) -> E
             where=label,
             found=listed(list(entries)),
             next_step=f"Name one behind a #, such as {label}#{list(entries)[-1]}",
+            code="camera.several",
         )
     if name is None or name not in entries:
         raise InputError(

@@ -107,6 +107,7 @@ def _make_room(out: Path) -> None:
             found=", ".join(standing[:3]),
             expected="a new or empty folder, or an earlier demonstration to replace",
             next_step="Name another folder with -o",
+            code="output.foreign_files",
         )
     for name in standing:  # the session last, because it identifies the folder as a demonstration
         remove_folder(out / name)

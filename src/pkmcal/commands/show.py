@@ -37,6 +37,7 @@ def show(source: str, port: int, no_browser: bool, out: Path | None, as_json: bo
             "this option is for a page that is served",
             where="--port" if port else "--no-browser",
             next_step="Leave it out, or leave out -o",
+            code="option.not_applicable",
         )
     try:
         view = run(source)

@@ -223,13 +223,16 @@ def check_sides(view: MachineView, normals: Array, T_base_platform: Array) -> No
             what="the edges have their two sides exchanged",
             expected="side 0 on the right of a leg, looking along it from base to platform",
             next_step="see docs/conventions.md, Edges and sides",
+            code="edges.sides_exchanged",
         )
 
 
 def _of_pose(view: MachineView, T_base_platform: Array) -> Goal:
     machine = view.machine
     if not np.isfinite(T_base_platform).all():
-        raise InputError("the goal's pose holds a value that is not a finite number")
+        raise InputError(
+            "the goal's pose holds a value that is not a finite number", code="array.not_finite"
+        )
     _check_closes(view, T_base_platform)
     readings = machine.inverse(T_base_platform[None])[0]
     ranges = machine.joint_ranges
@@ -245,6 +248,7 @@ def _of_pose(view: MachineView, T_base_platform: Array) -> Goal:
             else "no reading that reaches it",
             expected=f"{ranges[k, 0]:.4g} to {ranges[k, 1]:.4g} {unit}",
             next_step="choose a goal inside the workspace",
+            code="pose.outside_workspace",
         )
     edges = true_edges(view, T_base_platform)
     if np.isnan(edges).any():
@@ -268,30 +272,38 @@ def _check_closes(view: MachineView, T_base_platform: Array) -> None:
             what="the machine cannot take the goal's pose",
             expected=f"a pose that a machine of motion {machine.document.motion!r} can take",
             next_step="give machine.forward(readings) of readings at the goal",
+            code="pose.not_admissible",
         )
     if float(fk.singularity) < NEAR_SINGULAR:
         raise InputError(
             what="the goal is nearly singular: there the platform moves with its motors locked",
             found=f"smallest singular value {float(fk.singularity):.2g}",
             expected=f"more than {NEAR_SINGULAR}; 1 is a good pose",
+            code="pose.singular",
         )
 
 
 def _of_image(sight: Sight | None, view: MachineView, goal: GoalImage) -> Goal:
     if sight is None:
-        raise InputError("a goal image needs the camera", next_step="give camera to VisualServo")
+        raise InputError(
+            "a goal image needs the camera",
+            next_step="give camera to VisualServo",
+            code="servo.no_camera",
+        )
     readings = np.asarray(goal.readings, dtype=float)
     value = track(sight, first_track_state(view), goal.image, readings)
     if not value.closed:
         raise GeometryError(
             what="no pose of the machine fits the readings of the goal image",
             next_step="check that they are in metres or radians, in the order of the motors",
+            code="readings.unreachable",
         )
     if not value.valid.any():
         raise GeometryError(
             what="no leg was found in the goal image",
             found=value.reasons[0],
             next_step="check the camera, its place and the light",
+            code="servo.goal_not_visible",
         )
     legs = legs_at(view, value.state.T_base_platform, readings)
     return Goal(value.lines.normal, aspect_of(view.machine, legs))

@@ -175,6 +175,7 @@ class VisualServo:
                 what="the calibration was refused: " + " ".join(saved.verdict.reasons),
                 where=str(folder),
                 next_step="control needs a machine that is known; calibrate again",
+                code="calibration.refused",
             )
         source = load_source(folder, session)
         if station not in source.T_base_camera:
@@ -183,6 +184,7 @@ class VisualServo:
                 where=str(folder),
                 found=station,
                 expected=" or ".join(source.T_base_camera),
+                code="calibration.no_station",
             )
         if station not in source.cameras:
             raise InputError(
@@ -191,6 +193,7 @@ class VisualServo:
                 found=station,
                 expected="the session above or beside the calibration, with its cameras",
                 next_step="give the session's folder as session",
+                code="camera.missing",
             )
         file = next(s.camera for s in saved.stations if s.name == station)
         shifts = {c["file"]: float(c["edge_shift"]) for c in saved.document.get("cameras", [])}
@@ -224,7 +227,11 @@ class VisualServo:
         Raises InputError for an image of another size or type than the camera's.
         """
         if self._sight is None:
-            raise InputError("an image needs the camera", next_step="give it to VisualServo")
+            raise InputError(
+                "an image needs the camera",
+                next_step="give it to VisualServo",
+                code="servo.no_camera",
+            )
         check_image(image, self._sight.camera)
         q = self._checked(readings)
         at = track(self._sight, self._track, image, q)
@@ -420,7 +427,9 @@ def _root_mean_square(error: Array) -> float:
 
 def _check_positive(name: str, value: float) -> None:
     if not (np.isfinite(value) and value > 0):
-        raise InputError(f"{name} must be a positive number", found=value)
+        raise InputError(
+            f"{name} must be a positive number", found=value, code="servo.not_positive"
+        )
 
 
 def _limits(machine: Machine, limits: float | Array | None) -> Array | None:
@@ -428,5 +437,7 @@ def _limits(machine: Machine, limits: float | Array | None) -> Array | None:
         return None
     array = np.broadcast_to(np.asarray(limits, dtype=float), (machine.n_joints,))
     if not (np.isfinite(array) & (array > 0)).all():
-        raise InputError("rate limits must be positive numbers", found=array.tolist())
+        raise InputError(
+            "rate limits must be positive numbers", found=array.tolist(), code="servo.not_positive"
+        )
     return array

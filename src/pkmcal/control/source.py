@@ -100,6 +100,7 @@ def _station(
             where="--station",
             found=name,
             expected=" or ".join(names),
+            code="calibration.no_station",
         )
     wanted = [one for one in saved.stations if name in (None, one.name)]
     candidates = [one for one in wanted if eye is not None or one.name in source.cameras]
@@ -109,6 +110,7 @@ def _station(
             where=str(saved.path.parent),
             expected=", ".join(sorted({one.camera for one in wanted})),
             next_step="Name the session with --session, or the camera's file with --camera",
+            code="camera.missing",
         )
     return candidates[0]
 

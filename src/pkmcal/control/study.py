@@ -377,6 +377,7 @@ def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
             where=where,
             found=f"a gap of {1e3 * gap:.2g} mm in its limbs",
             expected="a pose that its constant rods, axes and motion allow",
+            code="pose.not_admissible",
         )
     low, high = machine.joint_ranges.T
     beyond = np.flatnonzero((readings < low) | (readings > high))
@@ -387,6 +388,7 @@ def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
             where=where,
             found=f"a reading of {readings[k]:.4g} {machine.joint_units[k]} for joint {k + 1}",
             expected=f"{low[k]:.4g} to {high[k]:.4g} {machine.joint_units[k]}",
+            code="pose.outside_workspace",
         )
 
 
@@ -413,5 +415,6 @@ def _drawn(eye: Eye, count: int, rng: np.random.Generator) -> Array:
             found=f"{len(out)} of {tried}",
             expected=str(count),
             next_step="Use a wider lens, another place for the camera, or fewer --legs",
+            code="station.sees_too_little",
         )
     return out

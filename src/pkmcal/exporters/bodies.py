@@ -265,6 +265,7 @@ def _holders(
                 " one",
                 where=home.machine.name,
                 next_step="tie the hinges of all legs on one bar",
+                code="export.bar_hinges",
             )
         out.append((bar, limbs.bar[j]))
     return out
@@ -367,6 +368,7 @@ def _carrier(
             "one body cannot do",
             where=home.machine.name,
             next_step="give both cranks the same center, axis, radial and zero",
+            code="export.motor_axes",
         )
     end = home.a[j] - body.T_parent_body[:3, 3]
     if turns:

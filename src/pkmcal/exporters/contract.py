@@ -177,6 +177,7 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
             where=source.origin,
             next_step="Calibrate again; or export it with --force; its files then"
             " state that it was refused",
+            code="calibration.refused",
         )
     more: list[Finding] = []
     machine = source.machine
@@ -204,6 +205,7 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
                 found=f"{difference.largest:.3g} {difference.unit}",
                 expected=f"at most {difference.limit:.3g} {difference.unit}",
                 next_step="This is a defect of pkmcal: report it, with the mechanism file",
+                code="export.reads_otherwise",
             )
     notes, values = (*more, *exporter.notes(source)), exporter.values(source)
     return Export(exporter, files, differences, notes, values)

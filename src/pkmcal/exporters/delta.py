@@ -368,6 +368,7 @@ def fit_of(
             " rotary one",
             expected="three sliders",
             next_step="Export it with --to klipper or --to reprap",
+            code="export.no_linear_delta",
         )
     return nearest_fit(delta, freedoms)
 

@@ -88,6 +88,7 @@ class BodiesModel(StarterSource):
                 where=path.name,
                 found=f"{len(text)} characters",
                 expected=f"at most {LARGEST_MODEL_FILE}",
+                code="file.too_large",
             )
         try:
             return _nominal(*_read(path, text), path, given.get("tube_radius"))

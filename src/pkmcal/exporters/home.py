@@ -124,6 +124,7 @@ def home_state(machine: Machine) -> HomeState:
             found="no readings" if fk is None else f"a gap of {float(fk.error) * 1e3:.3g} mm",
             expected="a pose that all legs reach",
             next_step="give home: {position: [x, y, z]} in the mechanism file",
+            code="mechanism.home_not_closed",
         )
     ends = limb_ends(layout, values, readings, fk.T_base_platform, fk.internal)
     line = ends.b - ends.a

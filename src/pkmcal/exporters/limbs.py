@@ -143,6 +143,7 @@ def rod_limbs(machine: Machine) -> Limbs:
             f"the rods and axes of mechanism {machine.name!r} do not fix its platform exactly",
             found=f"{layout.n_equations} equations for {unknowns} unknowns",
             expected="as many of both, for Newton's method",
+            code="export.not_determined",
         )
     return all_limbs(machine).of(np.flatnonzero(layout.closing))
 
@@ -164,6 +165,7 @@ def _chains(
                 found=getattr(machine.document.legs[leg], side).joint,
                 expected="a joint that is one of " + ", ".join(names),
                 next_step="Give its carrier a chain, see docs/export.md",
+                code="export.no_chain",
             )
         point[group.legs], axis[group.legs], arm[group.legs] = chain.point, chain.axis, chain.arm
         for leg in group.legs:

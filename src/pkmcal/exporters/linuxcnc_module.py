@@ -58,6 +58,7 @@ def linuxcnc_coordinates(machine: Machine) -> str:
             f" {len(free)} freedoms",
             expected="as many of both",
             next_step="Export it with --to c, and choose coordinates of your own",
+            code="export.joints_not_coordinates",
         )
     return "".join(sorted((COORDINATE_LETTERS[k] for k in free), key="XYZABC".index))
 

@@ -49,6 +49,7 @@ class Ros(Exporter):
                 where=source.origin,
                 expected="a folder that pkmcal calibrate wrote",
                 next_step="Calibrate first; a mechanism file alone has no cameras",
+                code="export.no_cameras",
             )
         out = {ROS_LAUNCH_FILE: _launch(source)}
         frames = frame_names(source)

@@ -58,5 +58,6 @@ def samples(
         raise ResultError(
             f"mechanism {machine.name!r} has no poses within its ranges to compare an export at",
             next_step="Check the ranges in the mechanism file",
+            code="export.no_workspace",
         )
     return poses[good][:count], joints[good][:count]

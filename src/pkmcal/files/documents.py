@@ -74,6 +74,7 @@ def _raw_blocks(path: Path, label: str, largest: int, block_bytes: int) -> Itera
                     where=label,
                     found=f"{size} bytes",
                     expected=f"at most {largest}",
+                    code="file.too_large",
                 )
             rest: list[bytes] = []
             while block := stream.read(block_bytes):
@@ -86,11 +87,16 @@ def _raw_blocks(path: Path, label: str, largest: int, block_bytes: int) -> Itera
             yield b"".join(rest)
     except FileNotFoundError:
         raise InputError(
-            "the file does not exist", where=label, expected=wanted_file(path)
+            "the file does not exist",
+            where=label,
+            expected=wanted_file(path),
+            code="file.missing",
         ) from None
     except OSError as error:
         reason = error.strerror or type(error).__name__
-        raise InputError(f"the file cannot be read ({reason})", where=label) from None
+        raise InputError(
+            f"the file cannot be read ({reason})", where=label, code="file.unreadable"
+        ) from None
 
 
 def _decoded(raw: bytes, label: str, before: int) -> str:
@@ -105,6 +111,7 @@ def _decoded(raw: bytes, label: str, before: int) -> str:
             found=f"byte 0x{raw[error.start]:02x}",
             expected="UTF-8",
             next_step="Save it as UTF-8 in the editor",
+            code="file.not_text",
         ) from None
     if "\0" in text:
         line = before + text.count("\n", 0, text.index("\0")) + 1
@@ -114,6 +121,7 @@ def _decoded(raw: bytes, label: str, before: int) -> str:
             found="a zero byte",
             expected="UTF-8, which has none",
             next_step="Save it as UTF-8 in the editor",
+            code="file.not_text",
         )
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
@@ -233,7 +241,7 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
         data = builder.value(node, ())
     except _LimitError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise InputError(str(error.problem), where=label + line) from None
+        raise InputError(str(error.problem), where=label + line, code=error.note) from None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f", line {mark.line + 1}" if mark else ""
@@ -246,7 +254,10 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
         ) from None
     except yaml.reader.ReaderError as error:
         raise InputError(
-            "not a text file", where=label, found=f"character #x{error.character:04x}"
+            "not a text file",
+            where=label,
+            found=f"character #x{error.character:04x}",
+            code="file.not_text",
         ) from None
     if not isinstance(data, dict):
         raise InputError(
@@ -277,6 +288,7 @@ def _checked(document: Document) -> Document:
             raise InputError(
                 f"nested too deeply, in more than {MOST_NESTED_LEVELS} levels",
                 where=document.where(*keys),
+                code="file.nested_too_deeply",
             )
         if isinstance(value, str):
             _check_characters(document, keys, value)
@@ -314,7 +326,7 @@ def yaml_text(data: Mapping[str, Any]) -> str:
 
 
 class _LimitError(yaml.MarkedYAMLError):
-    """A file exceeds one of the limits."""
+    """A file exceeds one of the limits; note : the code of the error."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -332,12 +344,13 @@ class _Loader(yaml.SafeLoader):
         if self.depth > MOST_NESTED_LEVELS:
             mark = self.peek_event().start_mark
             what = f"{self.top} is nested too deeply, in more than {MOST_NESTED_LEVELS} levels"
-            raise _LimitError(problem=what, problem_mark=mark)
+            raise _LimitError(problem=what, problem_mark=mark, note="file.nested_too_deeply")
         self.nodes += 1
         if self.nodes > MOST_YAML_NODES:
             raise _LimitError(
                 problem=f"there are more than {MOST_YAML_NODES} keys and values up to here",
                 problem_mark=self.peek_event().start_mark,
+                note="file.too_many_values",
             )
         self.depth += 1
         try:
@@ -404,7 +417,10 @@ class _Builder:
         self._count_up(node)
         if len(keys) > MOST_NESTED_LEVELS:
             raise self._error(
-                node, f"nested too deeply, in more than {MOST_NESTED_LEVELS} levels", keys
+                node,
+                f"nested too deeply, in more than {MOST_NESTED_LEVELS} levels",
+                keys,
+                "file.nested_too_deeply",
             )
         self._open.add(id(node))
         try:
@@ -475,7 +491,9 @@ class _Builder:
             if number > most:
                 repeated = ", of which aliases (*) repeat many" if self._aliases else ""
                 raise self._error(
-                    node, f"the file holds too many {what}, more than {most}{repeated}"
+                    node,
+                    f"the file holds too many {what}, more than {most}{repeated}",
+                    code="file.aliases" if self._aliases else "file.too_many_values",
                 )
 
     def _scalar(self, node: yaml.Node) -> str | int | float | bool | None:
@@ -494,10 +512,13 @@ class _Builder:
             raise self._error(node, "a key is a list or a mapping; it should be a word")
         return node.value
 
-    def _error(self, node: yaml.Node, what: str, keys: Keys = ()) -> InputError:
+    def _error(
+        self, node: yaml.Node, what: str, keys: Keys = (), code: str | None = None
+    ) -> InputError:
         """Error at a node's line."""
         place = f", {field_path(keys)}" if keys else ""
-        return InputError(what, where=f"{self.label}, line {node.start_mark.line + 1}{place}")
+        where = f"{self.label}, line {node.start_mark.line + 1}{place}"
+        return InputError(what, where=where, code=code)
 
 
 _WIDEST = 160
@@ -586,7 +607,9 @@ def read_json(path: Path | str, label: str | None = None) -> Document:
     try:
         data = json.loads(text, parse_constant=_refuse)
     except RecursionError:
-        raise InputError("the file is nested too deeply to be read", where=label) from None
+        raise InputError(
+            "the file is nested too deeply to be read", where=label, code="file.nested_too_deeply"
+        ) from None
     except json.JSONDecodeError as error:
         raise InputError(
             f"not valid JSON ({error.msg})", where=f"{label}, line {error.lineno}"

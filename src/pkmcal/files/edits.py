@@ -171,6 +171,7 @@ class _Edit:
             f"this cannot be written without changing something else: {why}",
             where=self.document.where(*keys),
             next_step="Write it out by itself, as docs/files.md shows it",
+            code="file.not_editable",
         )
 
 

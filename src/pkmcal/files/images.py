@@ -117,6 +117,7 @@ def _image_class(head: bytes, label: str) -> Callable[[BinaryIO], ImageFile]:
                 expected="a PNG or JPEG file",
                 next_step=f"{install_step('heic')}; or set the camera to JPEG ('most compatible'),"
                 " or convert the images to JPEG, keeping their EXIF",
+                code="package.missing",
             ) from None
     else:
         raise ValueError("a format that is not read")
@@ -134,6 +135,7 @@ def _unreadable(length: int, label: str) -> InputError:
         where=label,
         expected="a PNG or JPEG file",
         next_step="Copy it from the camera again, or remove it",
+        code="image.unreadable" if length else "image.empty",
     )
 
 

@@ -39,8 +39,11 @@ def check_regular(path: Path, label: str) -> None:
             where=label,
             found=str(path.readlink()),
             expected="a file",
+            code="file.irregular",
         ) from None
     if stat.S_ISREG(mode):
         return
     kind = next((kind for is_kind, kind in _KINDS if is_kind(mode)), "something else")
-    raise InputError(f"this is {kind}, not a file", where=label, expected="a file")
+    raise InputError(
+        f"this is {kind}, not a file", where=label, expected="a file", code="file.irregular"
+    )

@@ -177,6 +177,7 @@ def _move(folder: Path, journal: _Journal) -> None:
             where=str(folder),
             found=f"the rest of them in {COMMITTED_FOLDER}",
             next_step=f"{next_step_after(error)}; then run this again, which finishes it",
+            code="file.unwritable",
         ) from None
     # The journal last: without it, no process could determine that all files have been moved.
     new = place / NEW_FILES_FOLDER

@@ -244,7 +244,9 @@ def _check_header(
         raise InputError(f"column {number} of the header has no name", where=where)
     twice = [name for name, times in Counter(header).items() if times > 1]
     if twice:
-        raise InputError(f"the header names {listed(twice)} twice", where=where)
+        raise InputError(
+            f"the header names {listed(twice)} twice", where=where, code="table.column_twice"
+        )
     if len(header) == len(first):
         raise InputError("there is no column of numbers", where=where, found=",".join(first))
     if columns is not None:

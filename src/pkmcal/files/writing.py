@@ -100,6 +100,7 @@ def check_own_folder(
             expected=f"a new or empty folder, or {earlier or what.replace('a ', 'an earlier ', 1)}"
             " to replace",
             next_step="Name another folder with -o, or move these files away",
+            code="output.foreign_files",
         )
     return standing
 
@@ -141,7 +142,9 @@ def place_below(folder: Path, name: str) -> Path:
     Raises `InputError` where it would be outside the folder.
     """
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts or not PurePath(name).name:
-        raise InputError("no file can have this name", where=str(folder), found=name)
+        raise InputError(
+            "no file can have this name", where=str(folder), found=name, code="file.impossible_name"
+        )
     return folder / name
 
 
@@ -230,6 +233,7 @@ def alone_in(folder: Path, what: str) -> Generator[None]:
                 f"another {what} works in this folder",
                 where=str(folder),
                 next_step="Wait until it has ended, or name another folder with -o",
+                code="output.in_use",
             )
         yield
     finally:
@@ -343,4 +347,5 @@ def _unwritable(path: Path, error: OSError) -> InputError:
         f"cannot be written ({error.strerror or error})",
         where=str(path),
         next_step=next_step_after(error),
+        code="file.unwritable",
     )

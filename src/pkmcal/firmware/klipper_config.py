@@ -291,6 +291,7 @@ class _Includes:
                         where=place,
                         found=quoted(line.strip()),
                         expected="files that do not include one another in a circle",
+                        code="printer.include_circle",
                     )
                 yield from self._included(one, place, (*within, path))
         yield chunk
@@ -304,6 +305,7 @@ class _Includes:
                 where=place,
                 expected=f"{MOST_INCLUDED_FILES} at most",
                 next_step="Make a copy without macros, and include the printer's own files",
+                code="printer.too_many_includes",
             )
         text = read_text(path, largest=LARGEST_WRITTEN_FILE)
         lines = ((f"{path.name}, line {n}", one) for n, one in enumerate(text.splitlines(), 1))
@@ -356,4 +358,5 @@ def _check_saved(text: str, label: str) -> None:
             if marked
             else f"Put '{SAVED_LINE_MARK} ' before it, remove it if it is empty, or move it"
             " above the header; then restart Klipper",
+            code="printer.saved_lines_dropped",
         )

@@ -154,6 +154,7 @@ class Repetier(Firmware):
                 found="no steps_per_mm" if steps is None else f"steps_per_mm {[*steps]}",
                 expected="steps_per_mm in the mechanism file, equal for all legs, such as"
                 " [80, 80, 80]",
+                code="export.no_steps",
             )
         return np.array(steps)
 

@@ -151,6 +151,7 @@ def _check(machine: Machine, measurements: Measurements) -> None:
         raise InputError(
             what="there is neither an edge nor a board's pose to calibrate from",
             next_step="check the images, the stations' poses and the tubes of the nominal model",
+            code="measurements.none",
         )
     if joints.shape[-1] != machine.n_joints:
         raise InputError(
@@ -202,6 +203,7 @@ def _unknown_columns(measurements: Measurements) -> list[Column]:
                 what=f"the effect {one.code} cannot have a prior: motions of stations are linear"
                 " about a solution only",
                 next_step="state what it does to edges, poses or readings, or leave its prior out",
+                code="effect.prior_of_motion",
             )
     return columns
 

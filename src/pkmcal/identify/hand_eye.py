@@ -180,6 +180,7 @@ def _check_identifiable(problem: PairProblem, pair: Pair) -> None:
             found="configurations along a line, or all alike",
             expected="configurations that move the platform in two directions, or turn it",
             next_step="add such configurations, or give the station's rough pose",
+            code="station.unidentifiable",
         )
 
 
@@ -261,6 +262,7 @@ def start_from_poses(
             expected=f"a board on the platform in {LEAST_PAIR_CONFIGURATIONS} configurations, a"
             " board that another station also sees, or a rough pose",
             next_step="give the station's pose: in session.yaml",
+            code="station.unattached",
         )
     return State(
         machine.values,

@@ -107,6 +107,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
             raise InputError(
                 "this table as a DataFrame needs pandas",
                 next_step="Install it with: pip install pandas",
+                code="package.missing",
             ) from None
         return pd.DataFrame(self.records(), columns=list(PARAMETER_ESTIMATE_COLUMNS)).set_index(
             "name"

@@ -219,6 +219,7 @@ def _check_same_machine(a: ComparedMachine, b: ComparedMachine) -> None:
         expected=f"{a.machine.name}, {a.machine.n_legs} legs, {len(one)} parameters, as in"
         f" {a.name}",
         next_step="Compare calibrations or nominal models of one machine",
+        code="difference.machines",
     )
 
 

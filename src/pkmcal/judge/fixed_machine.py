@@ -208,7 +208,8 @@ def hold(
     if solution.stop[0] is not Stop.CONVERGED:
         raise ResultError(
             "the platform's poses were not found with the calibrated machine:"
-            f" {solution.stop[0].value}"
+            f" {solution.stop[0].value}",
+            code="poses.not_converged",
         )
     state: BatchState = solution.state
     still = still.with_values(problem.theta(state)[0])
@@ -248,6 +249,7 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
         expected="legs, a board or whole poses in several more configurations; heights determine"
         " no pose",
         next_step="Take images of more configurations from each station",
+        code="validation.few_measurements",
     )
 
 

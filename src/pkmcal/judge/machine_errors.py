@@ -71,6 +71,7 @@ def compare(
             found=f"{machine.name}, {machine.n_legs} legs, {len(machine.parameters)} parameters",
             expected=f"{known.name}, {known.n_legs} legs, {len(known.parameters)} parameters",
             next_step="Compare machines of one nominal model",
+            code="difference.machines",
         )
     # two exact machines: the covariances of centres and tool are not used
     joints = np.asarray(joints, dtype=float)

@@ -63,6 +63,7 @@ def check_new(valid: Booleans, visible: Booleans, what: str, expected: str, next
             found=f"{used} configurations, all of them used",
             expected=expected,
             next_step=next_step,
+            code="session.not_new",
         )
 
 

@@ -185,6 +185,7 @@ def require_repeats(session: Session) -> None:
             expected="a station from which configurations were imaged several times",
             next_step="Put a camera on a tripod and image some configurations several times,"
             " moving nothing in between",
+            code="session.no_repeats",
         )
     raise InputError(
         "the session has no repeated images",
@@ -193,6 +194,7 @@ def require_repeats(session: Session) -> None:
         expected=f"a pattern such as images/{name}/{{configuration}}_{{repeat}}.png",
         next_step="Take several images of some configurations, moving nothing in between, and"
         f" name the images images/{name}/0001_1.png, images/{name}/0001_2.png and so on",
+        code="session.no_repeats",
     )
 
 

@@ -284,4 +284,5 @@ def _check_usable(saved: SavedCalibration) -> None:
         found=saved.verdict.reasons[0] if saved.verdict.reasons else saved.verdict.headline,
         expected="a calibration that was not refused",
         next_step="Calibrate the machine first",
+        code="calibration.refused",
     )

@@ -94,6 +94,7 @@ def load_mechanism(
             where=label,
             found=str(source),
             expected=guess or f"a mechanism file, or {listed(sorted(built_in), len(built_in))}",
+            code="machine.unknown",
         )
     document, checked = _built_in(path, label) if str(source) in built_in else _read(path, label)
     if model is not None:

@@ -191,6 +191,7 @@ class Follower:
                 found=f"closure error {float(fk.error) * 1e3:.3g} mm",
                 expected="readings that the machine can reach, near those before them",
                 next_step="check the readings, or begin anew with a start near the pose",
+                code="readings.unreachable",
             )
         self._reset(fk.T_base_platform)
 

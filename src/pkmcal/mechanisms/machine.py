@@ -262,6 +262,7 @@ class Machine:
                 expected="a platform that all legs reach",
                 next_step="check the nominal model's centres and ranges, or give home:"
                 " {position: ...}",
+                code="mechanism.not_assembled",
             )
         return fk.T_base_platform[good[0]]
 
@@ -292,6 +293,7 @@ class Machine:
                 found=f"closure error {float(np.max(fk.error)) * 1e3:.3g} mm",
                 expected="readings that the machine can reach",
                 next_step="check the readings, or give a start nearer to the pose",
+                code="readings.unreachable",
             )
         return fk.T_base_platform
 
@@ -572,5 +574,7 @@ def _finite_array(values: Array, tail: tuple[int, ...], name: str) -> Array:
             expected=f"(n, {', '.join(map(str, tail))})",
         )
     if not np.isfinite(array).all():
-        raise InputError(what=f"{name} holds a value that is not a finite number")
+        raise InputError(
+            what=f"{name} holds a value that is not a finite number", code="array.not_finite"
+        )
     return array

@@ -193,7 +193,9 @@ class ParameterTable:
             turn = {owner[k]: s * sign[k] for k, s in zip(members, own, strict=True)}
             if any(turn[owner[k]] != s * sign[k] for k, s in zip(members, own, strict=True)):
                 raise InputError(
-                    what="a parameter is tied to its own opposite", found=", ".join(group)
+                    what="a parameter is tied to its own opposite",
+                    found=", ".join(group),
+                    code="mechanism.tied_to_opposite",
                 )
             # Merge the groups into the first one's, with signs relative to it.
             first = min(turn)

@@ -261,6 +261,7 @@ def extents(
             what="the search for the workspace begins at a pose that the machine cannot take",
             found="; ".join(at_start.why()),
             next_step="begin at the home pose, or check the ranges in the mechanism file",
+            code="pose.outside_workspace",
         )
     twists = _twists(directions)
     if most is not None:

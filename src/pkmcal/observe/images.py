@@ -58,7 +58,9 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         check_regular(path, label)
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=label) from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=label, code="file.unreadable"
+        ) from None
     image = open_image(BytesIO(data), label)
     size = sensor_size(image)  # before decoding, which takes memory for the header's size
     if tuple(image_size) not in (size, size[::-1]):
@@ -168,6 +170,7 @@ def _undecodable(label: str, found: str) -> InputError:
         found=found,
         expected="a whole PNG or JPEG file",
         next_step="Copy it again from the camera, or remove it: an absent image is allowed",
+        code="image.damaged",
     )
 
 

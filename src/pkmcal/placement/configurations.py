@@ -77,6 +77,7 @@ def draw_configurations(
         found=f"{value} of {tried} tried",
         expected=f"{count}",
         next_step="check the ranges and centres in the mechanism file",
+        code="mechanism.few_configurations",
     )
 
 

@@ -240,6 +240,7 @@ def _check_observed(rig: Rig, candidates: Candidates, measurements: Measurements
         found="no leg, or board, in the picture",
         expected="a camera that looks at the machine",
         next_step="Check its pose, or let places be chosen: --places 3",
+        code="station.sees_too_little",
     )
 
 

@@ -140,6 +140,7 @@ def as_it_stands(
                 where=str(saved.path),
                 found=saved.verdict.headline,
                 next_step="Plan without it: --from-drawing",
+                code="calibration.refused",
             )
     if same_place and saved is None:
         raise InputError(

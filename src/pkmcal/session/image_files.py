@@ -105,7 +105,9 @@ def image_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
         with path.open("rb") as stream:
             return sensor_size(open_image(stream, label))
     except OSError as error:
-        raise InputError(f"the image cannot be read ({error.strerror})", where=label) from None
+        raise InputError(
+            f"the image cannot be read ({error.strerror})", where=label, code="file.unreadable"
+        ) from None
 
 
 def label_of(folder: Path, path: Path) -> str:
@@ -192,6 +194,7 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
         f" {pattern.removesuffix(suffix)}{others[0]}"
         if others
         else None,
+        code="images.none",
     )
 
 

@@ -379,6 +379,7 @@ def load_session_to_plan(folder: Path | str) -> Session:
             expected="one entry a camera, or a tracker, in one place",
             next_step="Where readings alone are calibrated from, spread the poses over all that the"
             " machine reaches",
+            code="session.no_station",
         )
     return session
 
@@ -454,6 +455,7 @@ def _session_document(folder: Path) -> tuple[Path, Document]:
             "there is no such session folder",
             where=str(folder),
             next_step=f"There is {folder.with_name(beside)}" if beside else None,
+            code="session.missing",
         )
     if not (folder / SESSION_FILE_NAME).exists():
         below = sorted(path.parent.name for path in folder.glob(f"*/{SESSION_FILE_NAME}"))
@@ -462,6 +464,7 @@ def _session_document(folder: Path) -> tuple[Path, Document]:
             where=str(folder),
             found=f"sessions in {listed(below)} below it" if below else None,
             next_step="Name the session's folder; pkmcal new DIR makes one to fill in",
+            code="session.missing",
         )
     document = read_yaml(folder / SESSION_FILE_NAME)
     version = document.data.get("pkmcal", SESSION_FILE_VERSION)
@@ -489,12 +492,16 @@ def _regular_file(folder: Path, document: Document, name: str, keys: Keys) -> Pa
             where=document.where(*keys),
             found=name,
             expected=wanted_file(path),
+            code="file.missing",
         ) from None
     except InputError as error:
         raise error.located(document.where(*keys)) from None
     except OSError as error:  # e.g. an invalid file name
         raise InputError(
-            f"the file cannot be read ({error.strerror})", where=document.where(*keys), found=name
+            f"the file cannot be read ({error.strerror})",
+            where=document.where(*keys),
+            found=name,
+            code="file.unreadable",
         ) from None
     return path
 
@@ -754,6 +761,7 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
                     where=document.where("stations", station.name, "images"),
                     found=image.path.name,
                     expected="its own images; a station is one camera in one place",
+                    code="station.same_images",
                 )
 
 
@@ -862,6 +870,7 @@ def _unmeasured(
             where=table.label,
             found=table.names[min(measured)],
             expected="two at least; one does not distinguish a joint's place from its offset",
+            code="configurations.only_one",
         )
     missing = [name for row, name in enumerate(table.names) if row not in measured]
     if not missing:

@@ -69,6 +69,7 @@ class PoseTable:
                 where=f"session.yaml, stations.{name}.tracker.noise",
                 found="neither position nor rotation",
                 expected="{position: 2.0e-5} in metres, {rotation: 1.0e-4} in radians, or both",
+                code="poses.no_noise",
             )
         kind = max(stated, key=stated.__getitem__)
         none = np.zeros(0, dtype=int)
@@ -147,6 +148,7 @@ def read_poses(
                 found=f"columns {', '.join(table.columns)}",
                 expected=f"noise: {{{unit}: ...}} of the tracker, in {stated}",
                 next_step=f"Leave these columns out, if no {what} were measured",
+                code="poses.no_noise",
             )
     rows = configuration_rows(table, names)
     if len(rows) < kind.fewest_rows:

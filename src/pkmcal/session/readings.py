@@ -101,6 +101,7 @@ def check_readings(
             found=listed(table.names),
             expected="two at least; one does not distinguish a joint's place from its offset",
             next_step="Move the machine and take more images; 15 configurations are usual",
+            code="configurations.only_one",
         )
     _check_mistakes(table, ranges, units)
     movement = _check_movement(table, noise) if len(table.names) > 1 else []

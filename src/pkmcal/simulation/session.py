@@ -173,6 +173,7 @@ def _check(folder: Path, nominal: Machine) -> None:
             where=str(folder),
             expected="a new or empty folder",
             next_step="name another folder, or remove what is in this one",
+            code="output.not_empty",
         )
     if not any(len(radii) for radii in nominal.radii()):
         raise InputError(

@@ -105,6 +105,7 @@ def check_new_folder(folder: Path | str) -> None:
             where=str(folder),
             expected="a new or empty folder",
             next_step="Name another folder; nothing was written into this one",
+            code="output.not_empty",
         )
 
 
@@ -143,6 +144,7 @@ def session_texts(
                     if generated
                     else "give the legs of a copy of the nominal model tubes"
                 ),
+                code="session.no_tubes",
             )
         if what is None and not has_tubes:
             what = "readings" if model.redundancy > 0 else "board"

@@ -94,6 +94,7 @@ def read_source(
             + listed([option_of(name) for name in source.options])
             if source.options
             else f"--from {path.name} alone",
+            code="option.not_applicable",
         )
     out = source.read(text, path, unit, given)
     if isinstance(out, NominalModel):

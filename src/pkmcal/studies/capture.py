@@ -207,6 +207,7 @@ def _chosen(visible: Booleans, n: int, *, shared: bool) -> tuple[Integers, Integ
                 + ("all stations at once" if shared else f"station {number + 1}"),
                 expected=str(n),
                 next_step="Move the camera back, use a wider lens, or fewer configurations",
+                code="station.sees_too_little",
             )
         first = sum(map(len, rows))
         taken[own] = True

@@ -61,6 +61,7 @@ def on_cluster(address: str, timeout: float = SCHEDULER_TIMEOUT) -> Runner:
             "a study on a cluster needs dask.distributed, which is not installed",
             where="--scheduler",
             next_step=install_step("cluster"),
+            code="package.missing",
         )
     if not _is_address(address):  # Dask's client reports a malformed address only late
         raise InputError(
@@ -132,9 +133,11 @@ def _run_tasks(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
             "the cluster's workers die again and again at one batch",
             found=str(error),
             next_step="Look whether they have enough memory; what is finished is kept",
+            code="study.workers_killed",
         ) from None
     except CancelledError:  # the client has lost its scheduler, which cancels all pending tasks
         raise ResultError(
             "the scheduler of the cluster is gone",
             next_step="Start it again; what is finished is kept, and the same command goes on",
+            code="study.scheduler_gone",
         ) from None

@@ -60,6 +60,7 @@ def on_cores(tasks: Sequence[Job], finished: Finished, count: int | None = None)
                     "processes that work on the study are killed again and again",
                     found=f"{fruitless} times at the same batches",
                     next_step="Look whether there is enough memory; what is finished is kept",
+                    code="study.workers_killed",
                 ) from None
     return count
 

@@ -68,6 +68,7 @@ class Store:
                         found=_description_text(before),
                         expected=_description_text(own),
                         next_step="Name another folder with -o, or remove this one",
+                        code="study.another",
                     )
             else:
                 write_text(path, json_text(own))
@@ -163,6 +164,7 @@ def _description(path: Path) -> dict[str, Any]:
         "this does not describe a study",
         where=str(path),
         next_step="Name another folder with -o, or remove this one",
+        code="study.unreadable",
     )
 
 

@@ -110,6 +110,7 @@ def subject_of(origin: str) -> StudySubject:
             expected=closest(origin, catalogue())
             or f"a session's folder, a mechanism file, the paper {STUDIED_PAPER}, or"
             f" {listed(sorted(catalogue()), 20)}",
+            code="machine.unknown",
         )
     machine = load_mechanism(origin, label=None)
     check_drawable(machine)
@@ -189,7 +190,9 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
                 expected=guess or f"NAME=V1,V2 with a name of {listed(list(subject.names), 20)}",
             )
         if name in out:
-            raise InputError("a name is varied twice", where="--vary", found=name)
+            raise InputError(
+                "a name is varied twice", where="--vary", found=name, code="study.name_twice"
+            )
         parts = [part.strip() for part in rest.split(",")]
         if not equals or not all(parts):
             raise InputError(
@@ -197,7 +200,9 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
             )
         values = [_value(name, subject.names[name], part) for part in parts]
         if len(set(values)) < len(values):
-            raise InputError("a value occurs twice", where="--vary", found=text)
+            raise InputError(
+                "a value occurs twice", where="--vary", found=text, code="study.value_twice"
+            )
         out[name] = tuple(values)
     return out
 

@@ -44,7 +44,9 @@ class PoseFile:
                 now = self._path.read_bytes()
             except OSError as error:
                 reason = error.strerror
-                raise InputError(f"cannot be read ({reason})", where=str(self._path)) from None
+                raise InputError(
+                    f"cannot be read ({reason})", where=str(self._path), code="file.unreadable"
+                ) from None
             # an edit of the user in the meantime must not be lost
             if now != self._last_bytes:
                 raise InputError(

@@ -123,6 +123,7 @@ def session_source(folder: Path, calibration: Path | None = None) -> Source:
             "there are no images to be shown",
             where=f"{session.folder / SESSION_FILE_NAME}, stations",
             expected="a station with a camera",
+            code="images.none",
         )
     folder = calibration or session.folder / CALIBRATION_FOLDER
     content, report = SessionContent(session, folder), folder / CALIBRATION_REPORT_FILE

@@ -43,12 +43,14 @@ def can_be_tried(machine: Machine, edges: int) -> None:
             what="the four steps are for legs with one joint on the base and one on the platform",
             found=f"mechanism {machine.name!r} with joints that move on cranks, slides or bars",
             next_step=USE_JOINT_METHOD,
+            code="method.other_joints",
         )
     if not edges:
         raise ResultError(
             what="the four steps need images of the legs, and no edge of one was measured",
             next_step=f"take images of the legs, or {USE_JOINT_METHOD} with a board on the"
             " platform",
+            code="method.no_edges",
         )
 
 
@@ -60,6 +62,7 @@ def every_leg_visible(machine: Machine, valid: Booleans) -> None:
             what=f"leg {lost[0] + 1} of {machine.n_legs} is seen by no station well enough",
             expected="every leg seen in two directions at least, [A] 3.3",
             next_step=f"add configurations or a station, or {USE_JOINT_METHOD}",
+            code="method.leg_not_visible",
         )
 
 
@@ -80,6 +83,7 @@ def stations_are_fixed(items: Items, views: StationViews, machine: Machine) -> N
         found=f"{visible.sum()} base centres{which}",
         expected=f"{need}, each leg seen in two directions",
         next_step=f"give the station's pose, fix a board to the base, or {USE_JOINT_METHOD}",
+        code="method.few_legs",
     )
 
 
@@ -104,6 +108,7 @@ def stations_are_joined(items: Items, views: StationViews) -> None:
         expected="stations that share three legs, or fewer with revolute axes, [A] 3.3",
         next_step="fix a calibration board to the base where the stations see it, or let a "
         f"station see more legs, or {USE_JOINT_METHOD} with the stations' poses",
+        code="method.stations_apart",
     )
 
 
@@ -139,6 +144,7 @@ def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, for
             expected="each leg seen at once with others that fix the platform, [A] 3.5",
             next_step=f"take images of the same configurations from more stations,"
             f" or {USE_JOINT_METHOD}",
+            code="method.legs_apart",
         )
     _needs_poses(legs, visible & posed[:, None])
 
@@ -154,6 +160,7 @@ def _too_few_at_once(legs: NominalJoints, at_once: Booleans) -> None:
         expected=f"{need}, [A] 3.5",
         next_step=f"let a station see more legs, image one configuration from several "
         f"stations, or {USE_JOINT_METHOD}",
+        code="method.few_legs_at_once",
     )
 
 
@@ -171,6 +178,7 @@ def _needs_poses(legs: NominalJoints, visible: Booleans) -> None:
                 "legs with a length",
                 expected="two directions at least, with three legs with a length at once, [A] 3.5",
                 next_step=f"add configurations or a station that sees it, or {USE_JOINT_METHOD}",
+                code="method.joint_unidentifiable",
             )
 
 
@@ -204,6 +212,7 @@ def lengths_are_fixed(
         found="distances between platform joints that do not depend on a combination of them",
         expected="legs that change their directions against each other, seen at once, [A] 3.4",
         next_step=f"add configurations that tilt and turn the platform more, or {USE_JOINT_METHOD}",
+        code="method.lengths_unidentifiable",
     )
 
 
@@ -218,6 +227,7 @@ def not_collapsed(legs: NominalJoints, q0: Array) -> None:
             "joints fall together, which fits the images for a wrong reason",
             next_step=f"check the nominal model's length, add configurations, or"
             f" {USE_JOINT_METHOD}",
+            code="method.length_collapsed",
         )
 
 
@@ -232,4 +242,5 @@ def passive_legs_are_fixed(machine: Machine, platform: Array) -> None:
             "on the platform, so its joint could lie anywhere along it",
             expected="two directions at least, [A] 3.5",
             next_step=f"add configurations that tilt or shift the platform, or {USE_JOINT_METHOD}",
+            code="method.leg_one_direction",
         )

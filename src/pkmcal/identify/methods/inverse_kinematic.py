@@ -270,6 +270,7 @@ def inverse_kinematic(machine: Machine, measurements: Measurements, start: State
             what="the inverse-kinematic method needs poses of a board on the platform",
             found="none",
             next_step="observe: board at a station, or use the method bundle",
+            code="method.no_platform_poses",
         )
     poses = poses.select(rows)
     if poses.rows.min() < 6:

@@ -201,6 +201,7 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
             "[B]'s linear method is for legs that turn about points of the base",
             found=f"mechanism {machine.name!r} with joints on cranks or slides",
             next_step=USE_DEFAULT_METHOD,
+            code="method.other_joints",
         )
     edges = measurements.edges
     alone = linear.centres(machine, measurements, "robust")
@@ -210,6 +211,7 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
             "[B]'s linear method needs three legs, each in two directions, at every station",
             found=f"{finite.sum(axis=1).min()} legs at one of them",
             next_step=USE_DEFAULT_METHOD,
+            code="method.few_legs",
         )
     # columns of each edge's shifts: its camera's, and its line's if lines are shaded
     n_cameras = measurements.n_cameras
