@@ -63,13 +63,8 @@ def validated_document(document: Document, model: type[SchemaModel]) -> SchemaMo
     if not others:
         raise first
     places = listed([place.removeprefix(f"{document.label}, ") for place in others])
-    raise InputError(
-        first.what,
-        where=first.where,
-        found=first.found,
-        expected=first.expected,
-        next_step=f"Then look at {places}",
-    )
+    step = f"{first.next_step.rstrip('.')}, then" if first.next_step else "Then"
+    raise first.with_fields(next_step=f"{step} look at {places}")
 
 
 def _check_numbers(document: Document, fields: dict[str, Any]) -> None:

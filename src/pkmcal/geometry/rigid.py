@@ -237,7 +237,7 @@ def look_at(position: VectorLike, target: VectorLike, up: VectorLike) -> Array:
     if np.linalg.norm(forward) < LEAST_VIEW_DISTANCE:
         raise InputError(
             "the camera looks at its own position",
-            found=f"look_at {list(target)}",
+            found=f"look_at {np.asarray(target).tolist()}",
             expected="a point in the middle of the image, away from position",
         )
     # lengths taken out first, so that the angle below is one between unit vectors
@@ -248,7 +248,7 @@ def look_at(position: VectorLike, target: VectorLike, up: VectorLike) -> Array:
     if angle < LEAST_UP_ANGLE:
         raise InputError(
             "up does not fix how the camera is turned about its view",
-            found=f"up {list(up)}, {np.rad2deg(angle):.2g} degrees from the line of sight",
+            found=f"up {np.asarray(up).tolist()}, {np.rad2deg(angle):.2g} degrees from the line of sight",
             expected="a direction across the view, towards the image's upper edge",
         )
     right = right / np.linalg.norm(right)
