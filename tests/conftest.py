@@ -10,7 +10,7 @@ import pickle
 import shutil
 from collections.abc import Callable, Collection, Iterable
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -18,7 +18,10 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import pytest
 from hypothesis import settings
 
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.refinement import RefinementOptions
+from pkmcal.camera_calibration.calibrate import CALIBRATION_CHECK_OPTIONS, calibrate_camera
+from pkmcal.camera_calibration.model_selection import MODEL_SELECTION_OPTIONS
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
 from pkmcal.planning.plan import PlanOptions, plan_measurements
@@ -161,7 +164,6 @@ def demo(common) -> Demo:
 @pytest.fixture(scope="session")
 def calibrating(demo, common) -> WithProgress[Calibration]:
     """The demonstration's session, calibrated from Python, with the progress messages."""
-    from pkmcal.calibration.calibrate import calibrate_session
 
     def make() -> WithProgress[Calibration]:
         progress: list[tuple[str, float]] = []
@@ -227,6 +229,34 @@ def quick_plans():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             "pkmcal.api.plan.plan_measurements", partial(plan_measurements, options=FEW_CANDIDATES)
+        )
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick_calibrations():
+    """Calibrations of the command and of Python's function, which have no such options, with few
+    imputations.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "pkmcal.api.calibrate.calibrate_session",
+            partial(calibrate_session, options=FEW_IMPUTATIONS),
+        )
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick_cameras():
+    """Calibrations of a camera, by the command and by Python's function, that compare two models
+    only.
+    """
+    selection = replace(MODEL_SELECTION_OPTIONS, models=("pinhole", "unified"))
+    options = replace(CALIBRATION_CHECK_OPTIONS, selection=selection)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "pkmcal.camera_calibration.calibrate.calibrate_camera",
+            partial(calibrate_camera, options=options),
         )
         yield
 
