@@ -138,11 +138,10 @@ class CameraProblem:
         usable = np.isfinite(value)
         shape = value.shape
         scale = self.scale[..., None, None]
+        retained = (scale > 0) & usable.reshape(*scale.shape[:3], 2, 1)
 
         def rows(jacobian: Array) -> Array:
-            flat = np.where(scale > 0, jacobian * scale, 0.0)
-            flat = flat.reshape(*shape, jacobian.shape[-1])
-            return np.where(usable[..., None], flat, 0.0)
+            return np.where(retained, jacobian * scale, 0.0).reshape(*shape, jacobian.shape[-1])
 
         shared = rows(by_parameters[..., self.free])
         if not len(self.free):
