@@ -8,8 +8,8 @@ import json
 import os
 import pickle
 import shutil
-from collections.abc import Callable, Collection, Iterable
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -246,10 +246,10 @@ def quick_calibrations():
         yield
 
 
-@pytest.fixture(scope="module")
-def quick_cameras():
-    """Calibrations of a camera, by the command and by Python's function, that compare two models
-    only.
+@contextmanager
+def two_camera_models() -> Iterator[None]:
+    """Calibrations of a camera, by the command and by Python's function, compare two models only:
+    all of them take seconds.
     """
     selection = replace(MODEL_SELECTION_OPTIONS, models=("pinhole", "unified"))
     options = replace(CALIBRATION_CHECK_OPTIONS, selection=selection)
@@ -258,6 +258,13 @@ def quick_cameras():
             "pkmcal.camera_calibration.calibrate.calibrate_camera",
             partial(calibrate_camera, options=options),
         )
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick_cameras():
+    """Calibrations of cameras whose model is not tested."""
+    with two_camera_models():
         yield
 
 
