@@ -123,9 +123,7 @@ class CameraProblem:
         off = (camera.project(there) - self.pixels) * self.scale[..., None]
         off = np.where(self.scale[..., None] > 0, off, 0.0)
         value = off.reshape(*off.shape[:2], -1)
-        return Values(
-            value, np.zeros((len(off), 0)), lambda: compact(self.linearize(state, value))
-        )
+        return Values(value, np.zeros((len(off), 0)), lambda: compact(self.linearize(state, value)))
 
     def linearize(self, state: CameraState, value: Array | None = None) -> Linear:
         """Whitened residuals and their exact derivatives; value : the residuals, if known."""
