@@ -90,7 +90,7 @@ BOUND = {
     ast.MatchAs: "name",
     ast.MatchStar: "name",
 }
-"""Nodes that bind an identifier, with the field of it; names and attributes where they are stored."""
+"""Nodes that bind an identifier, with its field; names and attributes where they are stored."""
 
 
 @cache
