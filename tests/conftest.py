@@ -68,15 +68,19 @@ def run(*words) -> Run:
 
 
 LONG = (
-    "test_cli", "test_study_executors", "test_fuzz", "test_board_session",
-    "test_camera_calibration", "test_silhouettes", "test_boards", "test_validate",
-    "test_calibrate_board", "test_pose_sessions", "test_docs", "test_handheld", "test_show",
-    "test_observe_search", "test_verbs", "test_watch_command", "test_servo", "test_repeats",
-    "test_site", "test_export_c", "test_study", "test_plan", "test_bundle", "test_heights",
-    "test_model_violations", "test_reproduce_b", "test_writing", "test_export_trees",
-    "test_simulate", "test_hostile", "test_paper_c", "test_response", "test_python",
-    "test_readings_alone", "test_paper_a", "test_watch", "test_edge_noise", "test_discrepancy",
-    "test_view", "test_profiles",
+    "test_cli", "test_camera_calibration", "test_board_session", "test_watch_command",
+    "test_cables", "test_view", "test_study_executors", "test_chance_matches", "test_handheld",
+    "test_fuzz", "test_docs", "test_silhouettes", "test_boards", "test_plan",
+    "test_calibrate_board", "test_calibration", "test_diagnose", "test_observe_search",
+    "test_paper_a", "test_verbs", "test_validate", "test_noise", "test_real", "test_heights",
+    "test_pose_sessions", "test_dialects", "test_from_bodies", "test_repeats", "test_study",
+    "test_show", "test_marlin", "test_paper_c", "test_export_mujoco", "test_servo", "test_bundle",
+    "test_reproduce_b", "test_eccentric_encoders", "test_hostile", "test_cameras",
+    "test_export_trees", "test_site", "test_export_firmware", "test_export", "test_accepted_inputs",
+    "test_profiles", "test_export_c", "test_hypotheses", "test_model_violations",
+    "test_report_page", "test_firmware_values", "test_accessibility", "test_simulate",
+    "test_legible", "test_writing", "test_response", "test_edge_noise", "test_check_forecast",
+    "test_cli_camera", "test_discrepancy", "test_readings_alone", "test_check", "test_python",
 )  # fmt: skip
 
 

@@ -340,8 +340,8 @@ def warm() -> None:
     for module in pkgutil.walk_packages(pkmcal.__path__, "pkmcal."):
         if not module.name.endswith("__main__") and "cluster" not in module.name:
             importlib.import_module(module.name)
-    for name in ("cv2", "scipy.optimize", "scipy.linalg", "scipy.stats", "rich.console", "rich.table",
-                 "rich.markup", "rich.text"):  # fmt: skip
+    for name in ("cv2", "scipy.optimize", "scipy.linalg", "scipy.stats", "rich.console",
+                 "rich.table", "rich.markup", "rich.text"):  # fmt: skip
         importlib.import_module(name)
     from pkmcal.files.quantities import unit
 
