@@ -8,9 +8,9 @@ import json
 import os
 import pickle
 import shutil
-from collections.abc import Callable, Collection, Iterable
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -18,7 +18,10 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import pytest
 from hypothesis import settings
 
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.refinement import RefinementOptions
+from pkmcal.camera_calibration.calibrate import CALIBRATION_CHECK_OPTIONS, calibrate_camera
+from pkmcal.camera_calibration.model_selection import MODEL_SELECTION_OPTIONS
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
 from pkmcal.planning.plan import PlanOptions, plan_measurements
@@ -65,15 +68,19 @@ def run(*words) -> Run:
 
 
 LONG = (
-    "test_cli", "test_study_executors", "test_fuzz", "test_board_session",
-    "test_camera_calibration", "test_silhouettes", "test_boards", "test_validate",
-    "test_calibrate_board", "test_pose_sessions", "test_docs", "test_handheld", "test_show",
-    "test_observe_search", "test_verbs", "test_watch_command", "test_servo", "test_repeats",
-    "test_site", "test_export_c", "test_study", "test_plan", "test_bundle", "test_heights",
-    "test_model_violations", "test_reproduce_b", "test_writing", "test_export_trees",
-    "test_simulate", "test_hostile", "test_paper_c", "test_response", "test_python",
-    "test_readings_alone", "test_paper_a", "test_watch", "test_edge_noise", "test_discrepancy",
-    "test_view", "test_profiles",
+    "test_cli", "test_camera_calibration", "test_board_session", "test_watch_command",
+    "test_cables", "test_view", "test_study_executors", "test_chance_matches", "test_handheld",
+    "test_fuzz", "test_docs", "test_silhouettes", "test_boards", "test_plan",
+    "test_calibrate_board", "test_calibration", "test_diagnose", "test_observe_search",
+    "test_paper_a", "test_verbs", "test_validate", "test_noise", "test_real", "test_heights",
+    "test_pose_sessions", "test_dialects", "test_from_bodies", "test_repeats", "test_study",
+    "test_show", "test_marlin", "test_paper_c", "test_export_mujoco", "test_servo", "test_bundle",
+    "test_reproduce_b", "test_eccentric_encoders", "test_hostile", "test_cameras",
+    "test_export_trees", "test_site", "test_export_firmware", "test_export", "test_accepted_inputs",
+    "test_profiles", "test_export_c", "test_hypotheses", "test_model_violations",
+    "test_report_page", "test_firmware_values", "test_accessibility", "test_simulate",
+    "test_legible", "test_writing", "test_response", "test_edge_noise", "test_check_forecast",
+    "test_cli_camera", "test_discrepancy", "test_readings_alone", "test_check", "test_python",
 )  # fmt: skip
 
 
@@ -161,7 +168,6 @@ def demo(common) -> Demo:
 @pytest.fixture(scope="session")
 def calibrating(demo, common) -> WithProgress[Calibration]:
     """The demonstration's session, calibrated from Python, with the progress messages."""
-    from pkmcal.calibration.calibrate import calibrate_session
 
     def make() -> WithProgress[Calibration]:
         progress: list[tuple[str, float]] = []
@@ -228,6 +234,41 @@ def quick_plans():
         patch.setattr(
             "pkmcal.api.plan.plan_measurements", partial(plan_measurements, options=FEW_CANDIDATES)
         )
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick_calibrations():
+    """Calibrations of the command and of Python's function, which have no such options, with few
+    imputations.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "pkmcal.api.calibrate.calibrate_session",
+            partial(calibrate_session, options=FEW_IMPUTATIONS),
+        )
+        yield
+
+
+@contextmanager
+def two_camera_models() -> Iterator[None]:
+    """Calibrations of a camera, by the command and by Python's function, compare two models only:
+    all of them take seconds.
+    """
+    selection = replace(MODEL_SELECTION_OPTIONS, models=("pinhole", "unified"))
+    options = replace(CALIBRATION_CHECK_OPTIONS, selection=selection)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "pkmcal.camera_calibration.calibrate.calibrate_camera",
+            partial(calibrate_camera, options=options),
+        )
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick_cameras():
+    """Calibrations of cameras whose model is not tested."""
+    with two_camera_models():
         yield
 
 

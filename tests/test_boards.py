@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import pytest
@@ -130,6 +132,17 @@ def aprilgrid(data, side=80):
     return np.ascontiguousarray(image[::-1, ::-1]), gap, side / data["marker"]
 
 
+@lru_cache(maxsize=3)
+def rays_between_pixels(model, image_size, parameters, fine):
+    """Rays (fine H, fine W, 3) of a camera, ``fine`` to a pixel in each direction."""
+    width, height = image_size
+    x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
+    camera = camera_models()[model](image_size, np.array(parameters))
+    rays = camera.ray(np.stack(np.meshgrid(x, y), axis=-1))
+    # between the pixels' centres rays are smooth; cv2 lays the finer grid centre on centre
+    return cv2.resize(rays, None, fx=fine, fy=fine, interpolation=cv2.INTER_CUBIC)
+
+
 def render(camera, T_camera_board, board, seed=0, noise=2.0, fine=4, hide=None):
     """Image of the board on a white sheet in front of a grey room, through the camera's rays.
 
@@ -141,10 +154,25 @@ def render(camera, T_camera_board, board, seed=0, noise=2.0, fine=4, hide=None):
     )
     shift = first + round(0.02 * scale)
     width, height = camera.image_size
-    x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
-    rays = camera.ray(np.stack(np.meshgrid(x, y), axis=-1))
-    # between the pixels' centres rays are smooth; cv2 lays the finer grid centre on centre
-    rays = cv2.resize(rays, None, fx=fine, fy=fine, interpolation=cv2.INTER_CUBIC)
+    parameters = tuple(camera.parameters.tolist())
+    rays = rays_between_pixels(camera.model, camera.image_size, parameters, fine)
+    # the rectangle of pixels that show the sheet, with its border's blur
+    along = np.linspace(0, 1, 40)
+    u, v = (np.concatenate(one) for one in zip(
+        (along, 0 * along), (along, 1 + 0 * along), (0 * along, along), (1 + 0 * along, along),
+        strict=True,
+    ))  # fmt: skip
+    sheet = np.stack([u * printed.shape[1], v * printed.shape[0]], axis=-1)
+    metres = np.concatenate([(sheet - shift) / scale, np.zeros((len(u), 1))], axis=-1)
+    outline = camera.project(apply(T_camera_board, metres))
+    low, high = np.zeros(2, dtype=int), np.array([width, height])
+    if np.isfinite(outline).all():
+        low, high = (
+            np.clip(edge, low, high).astype(int)
+            for edge in (outline.min(axis=0) - 3, outline.max(axis=0) + 4)
+        )
+    rows, columns = (slice(fine * low[k], fine * high[k]) for k in (1, 0))
+    rays = rays[rows, columns]
     back = inverse(T_camera_board)
     direction = rays @ back[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -155,7 +183,10 @@ def render(camera, T_camera_board, board, seed=0, noise=2.0, fine=4, hide=None):
     in_view = cv2.remap(
         printed, place[..., 0], place[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, GREY
     )
-    image = in_view.reshape(height, fine, width, fine).mean(axis=(1, 3))
+    image = np.full((height, width), float(GREY))
+    image[low[1] : high[1], low[0] : high[0]] = in_view.reshape(
+        high[1] - low[1], fine, high[0] - low[0], fine
+    ).mean(axis=(1, 3))
     if hide:
         x0, y0, x1, y1 = hide
         image[y0:y1, x0:x1] = 90

@@ -43,7 +43,7 @@ from pkmcal.camera_calibration.uncertainty import board_motion, projection_covar
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import Document
-from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
+from pkmcal.geometry.rigid import apply, dot, pose, pose_difference, rotation
 from pkmcal.judge.camera_difference import camera_difference
 from pkmcal.report.camera import outcome_of
 from pkmcal.web.report_page import report_page
@@ -91,18 +91,26 @@ def poses_for(camera, count, seed, tilt=0.6):
     rng = np.random.default_rng(seed)
     results = []
     while len(results) < count:
-        pixel = rng.uniform([80, 80], [SIZE[0] - 80, SIZE[1] - 80])
+        draws = [
+            (
+                rng.uniform([80, 80], [SIZE[0] - 80, SIZE[1] - 80]),
+                rng.normal(0, tilt, 3),
+                rng.uniform(0.8, 1.5),
+            )
+            for _ in range(100)
+        ]
+        pixel, turn, depth = (np.array(values) for values in zip(*draws, strict=True))
         ray = camera.ray(pixel)
         side = np.cross([0.0, 1.0, 0.0], ray)
-        side /= np.linalg.norm(side)
+        side /= np.linalg.norm(side, axis=-1, keepdims=True)
         facing = np.stack([side, np.cross(ray, side), ray], axis=-1)
-        rot = rotation(rng.normal(0, tilt, 3)) @ facing
-        middle = ray * DEPTH.get(camera.model, 0.2) * rng.uniform(0.8, 1.5)
+        rot = rotation(turn) @ facing
+        middle = ray * DEPTH.get(camera.model, 0.2) * depth[:, None]
         T = pose(rot, middle - rot @ BOARD.points.mean(axis=0))
-        pixels = camera.project(apply(T, BOARD.points))
-        if camera.in_image(pixels, 5).all() and abs(rot[:, 2] @ ray) > 0.6:
-            results.append(T)
-    return np.stack(results)
+        pixels = camera.project(apply(T[:, None], BOARD.points))
+        whole = camera.in_image(pixels, 5).all(axis=-1)
+        results += [*T[whole & (abs(dot(rot[..., 2], ray)) > 0.6)]]
+    return np.stack(results[:count])
 
 
 def detections(

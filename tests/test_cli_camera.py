@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import run
+from conftest import run, two_camera_models
 from document_keys import assert_keys
 from pkmcal.cameras import load_camera
 from rendered import once
@@ -60,7 +60,8 @@ def test_a_sessions_board_images(boards, tmp_path):
         "stations:\n"
         "  top: {camera: c.yaml, images: 'images/{configuration}.png', observe: board}\n"
     )
-    done = run("camera", folder, "-o", tmp_path / "out", "--model", "pinhole", "--json")
+    with two_camera_models():
+        done = run("camera", folder, "-o", tmp_path / "out", "--model", "pinhole", "--json")
     assert done.code == 0, done.err
     text = (folder / "session.yaml").read_text().replace("observe: board", "observe: legs")
     (folder / "session.yaml").write_text(text)

@@ -78,6 +78,20 @@ def words(name: str) -> set[str]:
     return set(re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower().split("_"))
 
 
+BOUND = {
+    ast.FunctionDef: "name",
+    ast.ClassDef: "name",
+    ast.arg: "arg",
+    ast.Name: "id",
+    ast.Attribute: "attr",
+    ast.ExceptHandler: "name",
+    ast.alias: "asname",
+    ast.MatchAs: "name",
+    ast.MatchStar: "name",
+}
+"""Nodes that bind an identifier, with its field; names and attributes where they are stored."""
+
+
 @cache
 def definitions(path: Path) -> tuple[tuple[str, int], ...]:
     """Identifiers that a file binds, with their lines."""
@@ -86,23 +100,14 @@ def definitions(path: Path) -> tuple[tuple[str, int], ...]:
 
 def bindings(path: Path) -> Iterator[tuple[str, int]]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        match node:
-            case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+        field = BOUND.get(type(node))
+        if field and isinstance(getattr(node, "ctx", ast.Store()), ast.Store):
+            name = getattr(node, field)
+            if name is not None:
                 yield name, node.lineno
-            case ast.arg(arg=name):
-                yield name, node.lineno
-            case ast.Name(id=name, ctx=ast.Store()):
-                yield name, node.lineno
-            case ast.Attribute(attr=name, ctx=ast.Store()):
-                yield name, node.lineno
-            case ast.ExceptHandler(name=str(name)) | ast.alias(asname=str(name)):
-                yield name, node.lineno
-            case ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)):
-                yield name, node.lineno
-            case _:
-                pass
 
 
+@cache
 def is_banned(name: str) -> bool:
     if name.startswith("test_"):
         return bool(words(name) & NO_TEST_WORDS)

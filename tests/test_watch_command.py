@@ -91,8 +91,16 @@ def spoiled(folder, what):
     path.write_text(json.dumps(document))
 
 
-def test_an_unchanged_machine(demo, later):
-    done = run("watch", demo.calibration, later.same, "-o", later.folder / "w", "--json")
+@pytest.fixture(scope="module")
+def unchanged(demo, later):
+    """Result of ``watch`` for the unchanged machine, and its folder."""
+    folder = later.folder / "w"
+    done = run("watch", demo.calibration, later.same, "-o", folder, "--json")
+    return SimpleNamespace(folder=folder, run=done)
+
+
+def test_an_unchanged_machine(unchanged):
+    done = unchanged.run
     assert done.err == ""
     assert done.code == done.json["exit_code"] == 0
     assert_keys("watch --json", done.json)
@@ -108,7 +116,7 @@ def test_an_unchanged_machine(demo, later):
         assert leg["zero"]["unit"] == "m"
     assert done.json["known_configurations"] == []
     assert len(done.json["configurations"]) == 4
-    page = page_document((later.folder / "w" / "watch.html").read_text())
+    page = page_document((unchanged.folder / "watch.html").read_text())
     assert page["verdict"]["headline"] == done.json["verdict"]["headline"]
     assert page["verdict"]["stamp"] == "Still as calibrated"
     tests, run_chart = (block["plots"] for block in page_blocks(page, "panels"))
@@ -117,9 +125,10 @@ def test_an_unchanged_machine(demo, later):
     assert all(bar["y"] < 1 for bar in bars["points"])  # thresholds
     (dots,) = (mark for mark in run_chart[0]["marks"] if mark["mark"] == "dots")
     assert [dot["x"] for dot in dots["points"]] == done.json["configurations"]
-    retained = json.loads((later.folder / "w" / "watch.json").read_text())
+    retained = json.loads((unchanged.folder / "watch.json").read_text())
     assert retained["pkmcal_watch"] == 1
     assert retained["legs"] == done.json["legs"]
+    assert retained["runs"] == done.json["runs"]
 
 
 def test_a_changed_machine_in_words(demo, later):
@@ -136,12 +145,12 @@ def test_a_changed_machine_in_words(demo, later):
     assert max(bars["points"], key=lambda bar: bar["y"])["key"] == "leg:3"
 
 
-def test_one_folder_holds_the_history_of_a_machine(demo, later, tmp_path):
+def test_one_folder_holds_the_history_of_a_machine(demo, later, unchanged, tmp_path):
     """Each later test adds its run; the same data again replace theirs."""
-    folder = tmp_path / "watch"
-    results = []
-    for session in (later.same, later.off, later.off):
-        printed = run("watch", demo.calibration, session, "-o", folder, "--json").json
+    folder = shutil.copytree(unchanged.folder, tmp_path / "watch")
+    results = [[one["result"] for one in unchanged.run.json["runs"]]]
+    for _ in range(2):
+        printed = run("watch", demo.calibration, later.off, "-o", folder, "--json").json
         document = json.loads((folder / "watch.json").read_text())
         assert printed["runs"] == document["runs"]
         results.append([one["result"] for one in document["runs"]])
@@ -169,9 +178,8 @@ def test_one_folder_holds_the_history_of_a_machine(demo, later, tmp_path):
     assert limit["at"] == 1
 
 
-def test_runs_against_another_calibration_are_kept_and_not_drawn(demo, later, tmp_path):
-    folder = tmp_path / "watch"
-    run("watch", demo.calibration, later.same, "-o", folder)
+def test_runs_against_another_calibration_are_kept_and_not_drawn(demo, later, unchanged, tmp_path):
+    folder = shutil.copytree(unchanged.folder, tmp_path / "watch")
     path = folder / "watch.json"
     document = json.loads(path.read_text())
     other = {**document["runs"][0], "calibration": "0" * 16, "result": "another_machine"}

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext, redirect_stdout, suppress
+from io import StringIO
 from pathlib import Path
 
 # Threads would be lost in a fork, and are slow on one core; OpenCV is set as by the command line.
@@ -16,11 +16,9 @@ from pathlib import Path
 os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "80"}
 os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
 
-from fuzz.bases import one_camera_model
+from fuzz.bases import make, one_camera_model
 from fuzz.cases import FIRST, telling
 from fuzz.run import Summary, run, warm
-
-MAKE = "import sys; from pathlib import Path; from fuzz.bases import make; make(Path(sys.argv[1]))"
 
 
 def main() -> int:
@@ -49,10 +47,16 @@ def main() -> int:
 def fuzz(given, place: Path) -> Summary:
     """The requested cases, or those until Ctrl-C."""
     bases = given.bases or place / "bases"
-    if not bases.exists():
-        made = [sys.executable, "-c", MAKE, str(bases)]
-        subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
     warm()
+    if not bases.exists():
+        # in a process of its own: it starts threads, which later forks would lose
+        child = os.fork()
+        if not child:
+            with redirect_stdout(StringIO()):
+                make(bases)
+            os._exit(0)
+        if os.waitpid(child, 0)[1]:
+            raise SystemExit("the files to spoil could not be made")
     summary = Summary()
     numbers = given.only or range(given.first, given.first + given.count)
     if given.telling:

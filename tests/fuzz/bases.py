@@ -25,6 +25,7 @@ from pkmcal.files import Exif, csv_text, with_exif, yaml_text
 from pkmcal.geometry.rigid import look_at, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
 from pkmcal.placement.default_camera import camera_of_size
+from pkmcal.planning.plan import PlanOptions, plan_measurements
 from pkmcal.simulation import Settings
 from rendered import rendered
 
@@ -370,6 +371,12 @@ def one_camera_model():
     return patch("pkmcal.camera_calibration.calibrate.calibrate_camera", quick)
 
 
+def few_candidates():
+    """Context in which a plan is chosen among few candidates."""
+    quick = partial(plan_measurements, options=PlanOptions(candidates=60, work_poses=20, rounds=1))
+    return patch("pkmcal.api.plan.plan_measurements", quick)
+
+
 def results(folder: Path) -> None:
     """Results of commands on these sessions; the calibration is usable.
 
@@ -378,7 +385,7 @@ def results(folder: Path) -> None:
     at = os.getcwd()  # noqa: PTH109
     os.chdir(folder)
     try:
-        with one_camera_model():
+        with one_camera_model(), few_candidates():
             run_commands()
     finally:
         os.chdir(at)

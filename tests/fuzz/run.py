@@ -340,9 +340,12 @@ def warm() -> None:
     for module in pkgutil.walk_packages(pkmcal.__path__, "pkmcal."):
         if not module.name.endswith("__main__") and "cluster" not in module.name:
             importlib.import_module(module.name)
-    for name in ("cv2", "scipy.optimize", "scipy.linalg", "scipy.stats", "rich.table",
-                 "rich.markup", "rich.text"):  # fmt: skip
+    for name in ("cv2", "scipy.optimize", "scipy.linalg", "scipy.stats", "rich.console",
+                 "rich.table", "rich.markup", "rich.text"):  # fmt: skip
         importlib.import_module(name)
+    from pkmcal.files.quantities import unit
+
+    unit("mm")  # reads the definitions of all units
     # Otherwise half of a refusal's time is the import of the command's module.
     with redirect_stdout(StringIO()):
         cli.main(["--help"])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
+Result = TypeVar("Result")
 SESSION_FILE = "session.yaml"
 """File that identifies a session's folder."""
 
@@ -69,6 +71,15 @@ class MachineSource:
     bed_by_parameters: Array | None = None
     bed_sigma: float | None = None
     session: str = ""
+    _results: dict[Hashable, Any] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def once(self, key: Hashable, compute: Callable[[], Result]) -> Result:
+        """Result of a computation from this source alone, which is retained under ``key``."""
+        if key not in self._results:
+            self._results[key] = compute()
+        return self._results[key]
 
     @property
     def identity(self) -> str:

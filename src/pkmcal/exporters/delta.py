@@ -358,19 +358,24 @@ def fit_of(
 ) -> Fit:
     """Parameters of a firmware for a source's machine, with the free parameters of its kind.
 
+    The text, its check, its values and its notes have the same fit, which is computed once.
     Raises InputError for a machine that is no delta, or a rotary one without `rotary`.
     """
-    delta = delta_of(source.machine, program, source.bed)
-    freedoms = linear if delta.kind == "linear" else rotary
-    if freedoms is None:
-        raise InputError(
-            f"{program} has settings for linear deltas, and mechanism {source.machine.name!r} is a"
-            " rotary one",
-            expected="three sliders",
-            next_step="Export it with --to klipper or --to reprap",
-            code="export.no_linear_delta",
-        )
-    return nearest_fit(delta, freedoms)
+
+    def fit() -> Fit:
+        delta = delta_of(source.machine, program, source.bed)
+        freedoms = linear if delta.kind == "linear" else rotary
+        if freedoms is None:
+            raise InputError(
+                f"{program} has settings for linear deltas, and mechanism"
+                f" {source.machine.name!r} is a rotary one",
+                expected="three sliders",
+                next_step="Export it with --to klipper or --to reprap",
+                code="export.no_linear_delta",
+            )
+        return nearest_fit(delta, freedoms)
+
+    return source.once(("fit", program, linear, rotary), fit)
 
 
 def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:

@@ -42,6 +42,7 @@ from pkmcal.solver.elimination import (
 )
 from pkmcal.solver.ranks import (
     NORMAL_RANK_TOLERANCE,
+    RANK_TOLERANCE,
     column_space,
     inverse_root,
     nonzero,
@@ -126,6 +127,13 @@ class Information:
             if sure.all():
                 return np.linalg.cholesky(inverse)
         return normal_root(normal, NORMAL_RANK_TOLERANCE, loose=False)
+
+    @cached_property
+    def root_of_rows(self) -> Array:
+        """As ``root``, from the rows, which hold all digits: by the normal matrix, directions of
+        rounding would count as determined.
+        """
+        return inverse_root(self.rows[0], RANK_TOLERANCE, loose=False)
 
     @cached_property
     def _inverse(self) -> tuple[Array, Booleans]:

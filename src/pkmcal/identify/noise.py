@@ -37,7 +37,6 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.row_sums import GroupRows, group_rows
 from pkmcal.levels import NEGLIGIBLE, UNEXPLAINED_SCALE
 from pkmcal.measurements.rows import RowGroups
-from pkmcal.solver.ranks import RANK_TOLERANCE, inverse_root
 
 LEAST_NOISE_FREEDOM = 5.0
 """Degrees of freedom n below which a sum of squares determines no noise: the relative standard
@@ -326,7 +325,7 @@ def noise_shares(info: Information, kind: int, options: NoiseOptions = NOISE) ->
     rows = group_rows(info.problem, info.state, kind)
     # The normal matrix holds half of the digits only: by its root, M would get directions of
     # rounding, which the unknowns absorb, but which seem to show that the others' noise is small.
-    half = inverse_root(info.rows[0], RANK_TOLERANCE, loose=False)
+    half = info.root_of_rows
     in_prior = info.problem.prior @ half
     of_prior = in_prior.mT @ in_prior
     runs = [

@@ -259,6 +259,8 @@ def _summed(parts: Array, target: Integers, shape: tuple[int, ...]) -> Array:
 
 def _root(square: Array) -> Array:
     """Square roots (..., d, d) with ``root^T root = square``; a square may be singular."""
+    if not square.any():  # no strips
+        return square
     try:
         return np.linalg.cholesky(square).mT
     except np.linalg.LinAlgError:
