@@ -248,7 +248,8 @@ def look_at(position: VectorLike, target: VectorLike, up: VectorLike) -> Array:
     if angle < LEAST_UP_ANGLE:
         raise InputError(
             "up does not fix how the camera is turned about its view",
-            found=f"up {np.asarray(up).tolist()}, {np.rad2deg(angle):.2g} degrees from the line of sight",
+            found=f"up {np.asarray(up).tolist()}, {np.rad2deg(angle):.2g} degrees from the line of"
+            " sight",
             expected="a direction across the view, towards the image's upper edge",
         )
     right = right / np.linalg.norm(right)
