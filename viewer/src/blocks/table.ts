@@ -10,7 +10,7 @@ import { copyText, tsv, yaml } from "./table_text";
 /** Rows of a long table before all are asked for, and from how many rows on a table is long. */
 const FIRST_ROWS = 12, LONG = 18;
 const SORTABLE = 3, COPYABLE = 4;
-/** Letters of a row's name that stays on one line. */
+/** Letters of a row's name that stays on one line, and of a text that needs no width of its own. */
 const SHORT_NAME = 16;
 
 export function dataTable(block: DataTable, { selection, printSteps }: Context): HTMLElement {
@@ -164,7 +164,8 @@ function tableRow(row: TableRow, columns: Column[], most: number): HTMLTableRowE
     const first = k === columns.findIndex((one) => one.form === "text");
     if (!first) {
       const value = column.form === "chance" ? row.values[k] ?? null : null;
-      const cell = h("td", { class: column.form, "data-tip": value !== null && value.toPrecision(2) }, ...children);
+      const long = column.form === "text" && text.length > SHORT_NAME;
+      const cell = h("td", { class: `${column.form}${long ? " long" : ""}`, "data-tip": value !== null && value.toPrecision(2) }, ...children);
       if (column.form === "shade") cell.style.setProperty("--share", String((row.values[k] ?? 0) / most));
       return cell;
     }
