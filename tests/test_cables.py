@@ -373,8 +373,8 @@ def test_one_untracked_pose_of_four_cables_is_refused(tmp_path):
 def test_what_needs_poses_of_readings_refuses_four_cables(tmp_path):
     _, readings, _ = four_cables(tmp_path / "s", 0)
     machine = pkmcal.load_session(tmp_path / "s").machine
-    for asked in (machine.limits, machine.follower, lambda: machine.forward(readings)):
+    for limited in (machine.limits, machine.follower, lambda: machine.forward(readings)):
         with pytest.raises(GeometryError):
-            asked()
+            limited()
     with pytest.raises(InputError):
         load_mechanism(tmp_path / "s" / "mechanism.yaml")

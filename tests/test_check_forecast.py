@@ -17,7 +17,15 @@ from faults import raises
 from pkmcal.api.check import CheckResult
 from pkmcal.checks import advice as words
 from pkmcal.checks.check import check_session
-from pkmcal.checks.forecast import Forecast, LegForecast, forecast
+from pkmcal.checks.forecast import (
+    A4_BOARD,
+    Forecast,
+    LegForecast,
+    _Capture,
+    _capture_information,
+    _with_base_board,
+    forecast,
+)
 from pkmcal.checks.pictures import (
     CAPTION_BAR_HEIGHT,
     PANE_GAP,
@@ -29,12 +37,15 @@ from pkmcal.checks.pictures import (
 )
 from pkmcal.checks.sentences import outcome_of
 from pkmcal.errors import InputError, ResultError
-from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.geometry.rigid import inverse, look_at, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
+from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.images import binned
 from pkmcal.observe.predict import tubes_of
 from pkmcal.outcome import Level
+from pkmcal.placement.default_camera import default_camera
 from pkmcal.planning.first import EdgesOf
+from pkmcal.planning.rig import LegsFrom, Rig, nominal_pools
 
 
 @pytest.fixture
@@ -73,6 +84,59 @@ def test_the_forecast_is_what_calibrate_then_states(checked_session, calibrated)
     # four configurations a station are few: which they are makes a third of it
     assert values.position == pytest.approx(tool.position.mean(), rel=0.5)
     assert values.orientation == pytest.approx(tool.orientation.mean(), rel=0.5)
+
+
+def by_hand(look, count):
+    """The first images of an inspection, each as one by hand."""
+    stations, parts = [], []
+    for part in look.stations:
+        whole = look.session.stations[part.images.station]
+        for k in range(len(part.images.configuration)):
+            images = replace(part.images.select(np.array([k])), station=len(stations))
+            quality = replace(part.quality, hidden=part.quality.hidden[[k]])
+            name = f"{whole.name}-{k}"
+            parts.append(replace(part, name=name, images=images, quality=quality))
+            photo = whole.images[k]
+            stations.append(
+                replace(whole, name=name, entry="phone", images=(photo,), handheld=True)
+            )
+    session = replace(look.session, stations=tuple(stations))
+    return replace(look, session=session, stations=tuple(parts[:count]))
+
+
+def test_the_forecast_of_images_by_hand(checked_session):
+    """Each has a pose of its own, so they give less than as many on tripods."""
+    look = checked_session.look
+    four, six = forecast(by_hand(look, 4)), forecast(by_hand(look, 6))
+    assert (four.handheld, four.photographs, six.photographs) == (True, 4, 6)
+    assert six.position < four.position
+    assert six.with_board <= six.position
+    assert {(leg.station, leg.leg) for leg in six.legs} == {("phone", j) for j in range(1, 7)}
+    assert sum(leg.tells for leg in six.legs) == pytest.approx(1)
+    assert six.position > forecast(look, 2).position
+    useful = replace(six, with_board=six.position / 2)
+    codes = [{one.code for one in words.advice(by_hand(look, 6), one)} for one in (six, useful)]
+    assert ["images.base_board" in some for some in codes] == [False, True]
+
+
+def test_a_board_on_the_base_stands_still_and_locates_the_cameras():
+    machine, camera = load_mechanism("gough-stewart"), default_camera()
+    poses = np.tile(machine.home(), (3, 1, 1))
+    poses[:, 2, 3] += [-0.02, 0.0, 0.02]
+    eyes = ([0.7, 0.3, 0.9], [-0.5, 0.6, 0.9], [0.2, -0.8, 0.9])
+    T = np.stack([look_at(np.array(eye), np.zeros(3), np.eye(3)[2]) for eye in eyes])
+    legs = tuple(LegsFrom(k, camera, T[k], nominal_pools(machine)) for k in range(3))
+    rig = Rig(machine, ("a", "b", "c"), T, np.zeros(3, dtype=int), 1e-5, legs)
+    joints, pairs = machine.inverse(poses), np.stack([np.arange(3)] * 2, axis=-1)
+    board = _with_base_board(rig, A4_BOARD)
+    seen = board.measured(joints, poses, pairs).poses
+    assert seen.station.tolist() == [0, 1, 2]
+    T_base_board = inverse(T) @ seen.T_station_target
+    np.testing.assert_allclose(T_base_board, T_base_board[:1].repeat(3, axis=0), atol=1e-12)
+    one, other = (
+        _capture_information(_Capture(some, poses, joints, pairs)).position for some in (rig, board)
+    )
+    assert other < 0.9 * one
 
 
 def test_more_images_reduce_the_forecast(checked_session):

@@ -40,11 +40,12 @@ def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, 
     """Advice for a session, the most useful first."""
     out = [
         *_second_station(forecast),
+        *_base_board(forecast),
         *_from_one_side(inspection),
         *_hidden_legs(inspection),
         *_slim_tubes(inspection),
     ]
-    if forecast is not None:
+    if forecast is not None and not forecast.handheld:
         for station, edges in zip(inspection.stations, forecast.edges, strict=True):
             out += _lost_edges(inspection, station, edges)
     return tuple(out)
@@ -59,6 +60,19 @@ def _second_station(forecast: Forecast | None) -> list[Finding]:
             "images.second_place",
             number=forecast.photographs,
             tool_sigma=forecast.second,
+            tool_sigma_before=forecast.position,
+        )
+    ]
+
+
+def _base_board(forecast: Forecast | None) -> list[Finding]:
+    """Advice to put a board on the base where hand-held images gain by it."""
+    if forecast is None or not forecast.with_board * RELEVANT_FACTOR < forecast.position:
+        return []
+    return [
+        note(
+            "images.base_board",
+            tool_sigma=forecast.with_board,
             tool_sigma_before=forecast.position,
         )
     ]
@@ -189,8 +203,11 @@ def _sheet(station: StationInspection) -> str:
 
 def forecast_figure(forecast: Forecast) -> Figure:
     """Key figure of the forecast."""
+    images = f"{forecast.photographs} such images a station"
+    if forecast.handheld:
+        images = count(forecast.photographs, "localized image")
     return Figure(
-        f"What would {forecast.photographs} such images a station give?",
+        f"What would {images} give?",
         ((brief(forecast.position * 1e3), "mm"), (brief(math.degrees(forecast.orientation)), "°")),
         "1σ of the platform's pose at given readings, mean over the joints' ranges",
     )
@@ -247,7 +264,7 @@ def forecast_part(forecast: Forecast) -> Part:
         tables = (shares, details)
     return Part(
         "forecast",
-        "What a full capture would give",
+        "What these images would give" if forecast.handheld else "What a full capture would give",
         terminal_text=_forecast_lines(forecast, poor),
         tables=tables,
     )
@@ -255,12 +272,16 @@ def forecast_part(forecast: Forecast) -> Part:
 
 def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
     """Sentences on the forecast, and on the legs with the least information and their causes."""
-    images = sum(len(edges.images) for edges in forecast.edges)
+    subject, source = f"{forecast.photographs} such images a station, over the joints' ranges,", ""
+    if forecast.handheld:
+        subject = f"These {count(forecast.photographs, 'localized image')}"
+    else:
+        images = sum(len(edges.images) for edges in forecast.edges)
+        source = f", by the edges of {count(images, 'image')}"
     out = [
-        f"{forecast.photographs} such images a station, over the joints' ranges, would determine"
-        f" the platform's position to {brief(forecast.position * 1e3)} mm and its orientation to"
-        f" {brief(math.degrees(forecast.orientation))}° (standard deviations at given readings, by"
-        f" the edges of {count(images, 'image')}). Of its variance"
+        f"{subject} would determine the platform's position to {brief(forecast.position * 1e3)} mm"
+        f" and its orientation to {brief(math.degrees(forecast.orientation))}° (standard deviations"
+        f" at given readings{source}). Of its variance"
         f" {sum(leg.variance for leg in forecast.legs):.0%} comes from the edges,"
         f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from the priors"
         " of the nominal model and of shading."

@@ -106,7 +106,7 @@ def _check(folder: Path, seed: int, repeat: bool, progress: Progress) -> Session
     # Forecast of a full capture.
     progress("What such images will give", searched)
     expected = None
-    if observed.inspection and not by_hand:  # no station for further images
+    if observed.inspection:
         try:
             expected = forecast(observed.inspection)
         except (PkmcalError, np.linalg.LinAlgError) as error:

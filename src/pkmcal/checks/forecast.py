@@ -1,30 +1,35 @@
-"""Predicted accuracy of a full capture, from a station's first images.
+"""Predicted accuracy of a full capture from a station's first images, or of hand-held images.
 
 The first images are measured as `calibrate` measures them. The information of their edges, in
 pixels and with lost edges as zero, predicts that of others: every edge that is visible in
 configurations drawn over the joints' ranges gets the information of a similar one, drawn at random.
 With these edges the problem of the joint estimate is assembled as for a real session, and its
-covariance is propagated to the platform.
+covariance is propagated to the platform. Hand-held images have no station for more of them: what is
+predicted is the accuracy that the localized ones give by themselves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, numbered
-from pkmcal.checks.inspection import Inspection
+from pkmcal.boards.board import Board, chessboard, load_board
+from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import Information
+from pkmcal.measurements import Mount
 from pkmcal.observe.predict import tubes_of
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
-from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges
+from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges, joined_pools, spread_over
 from pkmcal.planning.information import tool_by_free
-from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
+from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, all_pairs
+from pkmcal.planning.subject import BOARD_MOUNT_NAME, PLAN_IMAGES_A_STATION
 
 NEAR_END = 0.15
 """Part of a joint's range, at either end, whose readings count as extreme; notes alone depend on
@@ -33,7 +38,12 @@ SECOND_STATION_TURN = np.pi / 2
 """Angle around the machine of a second station, rad: the direction that one camera determines
 worst, along its line of sight, the other determines best.
 """
+A4_BOARD = chessboard((8, 5), 0.03)
+"""Board whose use is weighed where a session has none: 270 by 180 mm, as printed on a sheet."""
 FORECAST_SEED = 7
+HANDHELD_PASSES = 2
+"""Measurement passes over hand-held images: the nominal model predicts each of them by a pose of
+its own, so far off that one pass loses edges that `calibrate` finds, and measures others worse."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +71,7 @@ class LegForecast:
 
 @dataclass(frozen=True)
 class Forecast:
-    """Predicted accuracy with ``photographs`` images at each station.
+    """Predicted accuracy with ``photographs`` images at each station, or hand-held ones in all.
 
     position, orientation : standard deviations of the platform's pose at given readings, mean over
         poses, m and rad, as `calibrate` states them.
@@ -69,7 +79,10 @@ class Forecast:
         from edges.
     second : position, m, if half of the images are taken a quarter turn around the machine; NaN
         with several stations or a panoramic camera.
-    edges : by station, for advice.
+    edges : by station, for advice; empty for hand-held images.
+    handheld : whether the images are hand-held.
+    with_board : position, m, by hand-held images with a board on the base; NaN if there is one, or
+        on tripods.
     """
 
     photographs: int
@@ -80,18 +93,25 @@ class Forecast:
     second: float
     legs: tuple[LegForecast, ...]
     edges: tuple[EdgesOf, ...] = ()
+    handheld: bool = False
+    with_board: float = np.nan
 
 
 def forecast(inspection: Inspection, images: int = CONFIGURATIONS_A_CAPTURE) -> Forecast | None:
-    """Forecast by the first images; None if the machine was not recognized at all stations.
+    """Forecast by the first images; None if the machine was not recognized at all stations, or in
+    no hand-held image.
 
-    Only legs are used, not boards and trackers. Raises a `PkmcalError` or a `LinAlgError` if these
-    images do not allow a forecast.
+    Only legs are used, not boards and trackers, but for a board on the base in hand-held images.
+    Raises a `PkmcalError` or a `LinAlgError` if these images do not allow a forecast.
     """
     machine, stations = inspection.session.machine, inspection.stations
-    whole = bool(stations) and all(station.recognised for station in stations)
     # the angles of hinges are not known without measurements
-    if not whole or machine.layout.n_internal:
+    if machine.layout.n_internal:
+        return None
+    by_hand = [inspection.session.stations[s.images.station].handheld for s in stations]
+    if any(by_hand):
+        return _by_hand(inspection) if all(by_hand) else None
+    if not stations or not all(station.recognised for station in stations):
         return None
     first = first_edges(
         inspection.session,
@@ -118,6 +138,61 @@ def forecast(inspection: Inspection, images: int = CONFIGURATIONS_A_CAPTURE) -> 
     )
 
 
+def _by_hand(inspection: Inspection) -> Forecast | None:
+    """Forecast of what the localized hand-held images give, each with a pose of its own."""
+    session = inspection.session
+    localized = [station for station in inspection.stations if station.recognised]
+    if not localized:
+        return None
+    # Information of the edges of some images, for all of them.
+    chosen = [
+        localized[k] for k in spread_over(np.arange(len(localized)), most=PLAN_IMAGES_A_STATION)
+    ]
+    first = first_edges(
+        session,
+        [station.images for station in chosen],
+        [np.zeros(1, dtype=int)] * len(chosen),
+        np.stack([station.T_camera_base for station in chosen]),
+        inspection.poses,
+        HANDHELD_PASSES,
+    )
+    pools = joined_pools(first.pools)
+    T_camera_base = np.stack([station.T_camera_base for station in localized])
+    rig = Rig(
+        session.machine,
+        tuple(station.name for station in localized),
+        T_camera_base,
+        numbered(session.camera_of_station[[s.images.station for s in localized]]),
+        session.joint_noise,
+        tuple(
+            LegsFrom(k, s.images.camera, s.T_camera_base, pools, s.images.binning)
+            for k, s in enumerate(localized)
+        ),
+        shading=first.estimate.statistics.shading,
+        temperatures=session.temperature,
+    )
+    number = np.arange(len(localized))
+    pairs = np.stack([number, [s.images.configuration[0] for s in localized]], axis=-1)
+    capture = _Capture(rig, inspection.poses, session.joints, pairs)
+    # With and without a board on the base.
+    has_board = session.board is not None and session.board_body == "base"
+    board = load_board(session.board) if session.board is not None else A4_BOARD
+    with_board = _capture_information(capture._replace(rig=_with_base_board(rig, board)))
+    information = with_board if has_board else _capture_information(capture)
+    entry = session.stations[localized[0].images.station].entry
+    return Forecast(
+        photographs=len(localized),
+        position=information.position,
+        orientation=information.orientation,
+        readings=information.readings,
+        drawing=information.drawing,
+        second=np.nan,
+        legs=_by_leg_of_all(entry, localized, first, information),
+        handheld=True,
+        with_board=np.nan if has_board else with_board.position,
+    )
+
+
 class _Capture(NamedTuple):
     """Images by a rig: pairs (M, 2) of station and configuration."""
 
@@ -136,6 +211,26 @@ class _CaptureInformation(NamedTuple):
     variance: Array
     readings: float
     drawing: float
+
+
+def _with_base_board(rig: Rig, board: Board) -> Rig:
+    """Rig with a board on the base in view of all stations, flat in the middle of its joints."""
+    middle = rig.machine.base_centers().mean(axis=0)
+    towards = inverse(rig.T_station_base)[:, :3, 3].mean(axis=0) - middle
+    normal = np.linalg.svd(rig.machine.base_centers() - middle)[2][-1]
+    normal *= -np.sign(normal @ towards)  # a board's print is on the side of its -z axis
+    across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    across /= np.linalg.norm(across)
+    R_base_board = np.stack([across, np.cross(normal, across), normal], axis=-1)
+    T_base_board = pose(R_base_board, middle - R_base_board @ board.points.mean(axis=0))
+    cameras = [one for one in rig.instruments if isinstance(one, LegsFrom)]
+    boards = (
+        BoardFrom(one.station, one.camera, one.T_camera_base, board.points, T_base_board,
+                  on_platform=False)
+        for one in cameras
+    )  # fmt: skip
+    mounts = (Mount(BOARD_MOUNT_NAME, "base", board.tolerance),)
+    return replace(rig, instruments=(*cameras, *boards), mounts=mounts, T_mount=T_base_board[None])
 
 
 def _planned_capture(inspection: Inspection, first: FirstEdges, images: int) -> _Capture:
@@ -268,4 +363,36 @@ def _by_leg(
                     variance=float(information.variance[s, j]),
                 )
             )
+    return tuple(out)
+
+
+def _by_leg_of_all(
+    name: str,
+    localized: Sequence[StationInspection],
+    first: FirstEdges,
+    information: _CaptureInformation,
+) -> tuple[LegForecast, ...]:
+    """Forecast for each leg in all hand-held images of a station's entry."""
+    tubes = tubes_of(first.estimate.machine)
+    hidden = np.mean([s.quality.hidden.mean(axis=0) for s in localized if s.quality], axis=0)
+    expected, valid = (
+        np.sum([getattr(edges, field).sum(axis=0) for edges in first.edges], axis=0)
+        for field in ("expected", "valid")
+    )
+    out: list[LegForecast] = []
+    for j in np.unique(tubes.leg).tolist():
+        mine = tubes.leg == j
+        number = int(expected[mine].sum())
+        sigma = first.sigma[np.isfinite(first.sigma[:, j]), j]
+        out.append(
+            LegForecast(
+                station=name,
+                leg=j + 1,
+                seen=float(1 - hidden[j]),
+                found=float(valid[mine].sum() / number) if number else float("nan"),
+                sigma=float(np.median(sigma)) if sigma.size else float("nan"),
+                tells=float(information.share[:, j].sum()),
+                variance=float(information.variance[:, j].sum()),
+            )
+        )
     return tuple(out)

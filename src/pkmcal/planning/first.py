@@ -134,13 +134,16 @@ def first_edges(
     rows: Sequence[Integers],
     T_camera_base: Array,
     poses: Array,
+    passes: int = 1,
 ) -> FirstEdges:
-    """Measure the edges of the first images, by a search and one measurement pass.
+    """Measure the edges of the first images, by a search and measurement passes.
 
     station_images : of S stations.
     rows : indices of the images to be measured, by station.
     T_camera_base : (S, 4, 4) localized poses.
     poses : T_base_platform (K, 4, 4) by the nominal model.
+    passes : measurement passes, each from the estimate by the one before: edges that were predicted
+        too far off are lost.
 
     Raises PkmcalError if there are too few edges for an estimate.
     """
@@ -159,20 +162,21 @@ def first_edges(
         )
 
     # Coarse edges by a search from the nominal model, and an estimate by them.
-    passes = legs.search_stations(placed_at(images, T_camera_base, poses), machine)
-    coarse = replace(measurements(concatenate([one.edges for one in passes])), shaded=False)
+    found = legs.search_stations(placed_at(images, T_camera_base, poses), machine)
+    coarse = replace(measurements(concatenate([one.edges for one in found])), shaded=False)
     # The accuracy of the search is a pixel, so its noise is not estimated.
     start = start_state(machine, coarse, T_camera_base)
     estimate = bundle(machine, coarse, start, scale_noise=False)
-    state = estimate.state
-    # One measurement pass from there, and the final estimate.
-    placed = placed_at(images, state.T_camera_base, state.T_base_platform)
-    passes = legs.measure_stations(placed, estimate.machine, {})
-    fine = measurements(concatenate([one.edges for one in passes]))
-    held = refinement_of(session, refine=False)
-    fine = replace(fine, intrinsics_factor=held.factor, intrinsics_at=held.at)
-    start = replace(state, columns={EDGE_SHIFT: state.columns[EDGE_SHIFT]})
-    estimate = bundle(machine, fine, start)
+    # Measurement passes from there, and the final estimate.
+    held, fine = refinement_of(session, refine=False), coarse
+    for _ in range(passes):
+        state = estimate.state
+        placed = placed_at(images, state.T_camera_base, state.T_base_platform)
+        found = legs.measure_stations(placed, estimate.machine, {})
+        fine = measurements(concatenate([one.edges for one in found]))
+        fine = replace(fine, intrinsics_factor=held.factor, intrinsics_at=held.at)
+        start = replace(state, columns={EDGE_SHIFT: state.columns[EDGE_SHIFT]})
+        estimate = bundle(machine, fine, start)
     return _edge_information(images, rows, estimate, fine.edges)
 
 

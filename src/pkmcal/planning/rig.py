@@ -88,25 +88,28 @@ class LegsFrom:
 
 @dataclass(frozen=True)
 class BoardFrom:
-    """Board on the platform, observed by a camera at T_camera_base (4, 4).
+    """Board on the platform or on the base, observed by a camera at T_camera_base (4, 4).
 
     points : (N, 3) corners, board frame, m.
-    T_platform_board : (4, 4).
+    T_body_board : (4, 4) in the frame of its body.
     sigma : of a corner, px.
     mount : its index.
+    on_platform : whether its body is the platform.
     """
 
     station: int
     camera: Camera
     T_camera_base: Array
     points: Array
-    T_platform_board: Array
+    T_body_board: Array
     sigma: float = NOMINAL_CORNER_SIGMA
     mount: int = 0
+    on_platform: bool = True
 
     def measure(self, at: At, rows: Integers, _rng: np.random.Generator | None, /) -> PoseSet:
         """Poses of the board where enough corners are visible."""
-        T = self.T_camera_base @ at.T_base_platform[rows] @ self.T_platform_board
+        T_base_body = at.T_base_platform[rows] if self.on_platform else np.eye(4)
+        T = np.tile(self.T_camera_base, (len(rows), 1, 1)) @ T_base_body @ self.T_body_board
         there = apply(T[:, None], self.points)
         visible = self._visible_corners(
             At(at.machine, at.joints[rows], at.T_base_platform[rows]), T, there
