@@ -218,7 +218,8 @@ def _with_base_board(rig: Rig, board: Board) -> Rig:
     middle = rig.machine.base_centers().mean(axis=0)
     towards = inverse(rig.T_station_base)[:, :3, 3].mean(axis=0) - middle
     normal = np.linalg.svd(rig.machine.base_centers() - middle)[2][-1]
-    normal *= -np.sign(normal @ towards)  # a board's print is on the side of its -z axis
+    if normal @ towards > 0:  # a board's print is on the side of its -z axis
+        normal = -normal
     across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     across /= np.linalg.norm(across)
     R_base_board = np.stack([across, np.cross(normal, across), normal], axis=-1)
