@@ -276,8 +276,8 @@ def test_a_board_is_seen_from_its_face_only():
     home = machine.home()[None]
     at = At(machine, machine.inverse(home), home)
     assert len(one.measure(at, np.arange(1), None)) == 1
-    turned = one.T_platform_board @ np.diag([1.0, -1.0, -1.0, 1.0])
-    assert len(replace(one, T_platform_board=turned).measure(at, np.arange(1), None)) == 0
+    turned = one.T_body_board @ np.diag([1.0, -1.0, -1.0, 1.0])
+    assert len(replace(one, T_body_board=turned).measure(at, np.arange(1), None)) == 0
 
 
 # ------------------------------------------------------------------ the way

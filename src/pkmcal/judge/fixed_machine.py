@@ -110,6 +110,7 @@ class Held:
     problem, state : problem with the final weights, and its solution.
     unknowns : names of the unknowns of a change: the machine's parameters, and the cameras'
         magnifications (as intrinsics).
+    stop : why the search for it ended; the step limit may have been reached.
     """
 
     machine: Machine
@@ -117,6 +118,7 @@ class Held:
     problem: Problem
     state: BatchState
     unknowns: tuple[str, ...]
+    stop: Stop
 
     def located(self, start: State) -> State:
         """Stations, boards and observed poses of the solution; the rest is that of ``start``."""
@@ -205,16 +207,12 @@ def hold(
     else:
         problem = assembled.trusting(data_weights.weights)
         solution = minimise(problem, begin)
-    if solution.stop[0] is not Stop.CONVERGED:
-        raise ResultError(
-            "the platform's poses were not found with the calibrated machine:"
-            f" {solution.stop[0].value}",
-            code="poses.not_converged",
-        )
+    if solution.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
+        raise not_found(solution.stop[0])
     state: BatchState = solution.state
     still = still.with_values(problem.theta(state)[0])
     if data_weights is None or magnified is None:
-        return Held(still, assembled.observed, problem, state, ("machine",))
+        return Held(still, assembled.observed, problem, state, ("machine",), solution.stop[0])
     # The same solution in a problem with magnifications, which are zero there.
     opened = assemble(still, magnified, default_gauge(still), shading=data_weights.shading)
     problem = opened.trusting(data_weights.weights)
@@ -223,7 +221,17 @@ def hold(
     columns = np.zeros((len(state.columns), u.effects.stop - u.effects.start))
     columns[:, np.delete(np.arange(columns.shape[1]), new - u.effects.start)] = state.columns
     state = replace(state, columns=columns)
-    return Held(still, assembled.observed, problem, state, ("machine", INTRINSICS))
+    return Held(
+        still, assembled.observed, problem, state, ("machine", INTRINSICS), solution.stop[0]
+    )
+
+
+def not_found(stop: Stop) -> ResultError:
+    """Error if the platform's poses are not found."""
+    return ResultError(
+        f"the platform's poses were not found with the calibrated machine: {stop.value}",
+        code="poses.not_converged",
+    )
 
 
 def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:

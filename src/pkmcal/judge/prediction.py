@@ -26,7 +26,7 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.gauge import pose_generators
 from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.judge.fixed_machine import Held, hold, too_little
+from pkmcal.judge.fixed_machine import Held, hold, not_found, too_little
 from pkmcal.levels import ROUNDING
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
@@ -35,6 +35,7 @@ from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result
 from pkmcal.solver.elimination import Linear, Reduced, eliminate, rows_on_shared
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space, inverse_root
+from pkmcal.solver.search import Stop
 
 SOFT_READING_NOISE = 0.01
 """Standard deviation (m, rad) of readings in the estimate of stations and poses: tens of times the
@@ -104,6 +105,8 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     measurements = replace(measurements, links=())
     near = hold(machine, measurements, start).located(start)
     held = hold(machine, replace(measurements, joint_noise=SOFT_READING_NOISE), near)
+    if held.stop is not Stop.CONVERGED:
+        raise not_found(held.stop)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])
