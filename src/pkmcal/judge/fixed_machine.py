@@ -208,7 +208,7 @@ def hold(
         problem = assembled.trusting(data_weights.weights)
         solution = minimise(problem, begin)
     if solution.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
-        raise not_found(solution.stop[0])
+        raise not_converged(solution.stop[0])
     state: BatchState = solution.state
     still = still.with_values(problem.theta(state)[0])
     if data_weights is None or magnified is None:
@@ -226,7 +226,7 @@ def hold(
     )
 
 
-def not_found(stop: Stop) -> ResultError:
+def not_converged(stop: Stop) -> ResultError:
     """Error if the platform's poses are not found."""
     return ResultError(
         f"the platform's poses were not found with the calibrated machine: {stop.value}",

@@ -26,7 +26,7 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.gauge import pose_generators
 from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.judge.fixed_machine import Held, hold, not_found, too_little
+from pkmcal.judge.fixed_machine import Held, hold, not_converged, too_little
 from pkmcal.levels import ROUNDING
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
@@ -106,7 +106,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     near = hold(machine, measurements, start).located(start)
     held = hold(machine, replace(measurements, joint_noise=SOFT_READING_NOISE), near)
     if held.stop is not Stop.CONVERGED:
-        raise not_found(held.stop)
+        raise not_converged(held.stop)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])
