@@ -15,6 +15,7 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.noise import components
 from pkmcal.identify.reduced_edges import reduced_edges
+from pkmcal.identify.row_sums import EDGE_ROWS, LINK_ROWS, POSE_ROWS, READING_ROWS
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import (
     EdgeSet,
@@ -205,10 +206,12 @@ def test_covariance_and_step_are_those_of_the_whole_problem(machine, case):
     links = problem.row_groups.links
     expected = remainder[:, links.rows][links.present].sum()
     assert 0 < expected < len(data.links[0])
-    assert freedom[3] == pytest.approx(expected, rel=1e-5)
+    assert freedom[LINK_ROWS] == pytest.approx(expected, rel=1e-5)
     poses = remainder[:, problem.row_groups.poses.rows].sum()
-    assert freedom[1] == pytest.approx(poses, rel=1e-5)
-    assert freedom[2] == pytest.approx(remainder[:, problem.closure_rows].sum(), rel=1e-4)
+    assert freedom[POSE_ROWS] == pytest.approx(poses, rel=1e-5)
+    assert freedom[READING_ROWS] == pytest.approx(
+        remainder[:, problem.closure_rows].sum(), rel=1e-4
+    )
 
 
 def test_pieces_say_what_the_whole_states(case):
@@ -276,14 +279,14 @@ def test_edges_of_linked_configurations(with_edges):
     freedom = components(info, weight).freedom[0]
     edges, links = problem.row_groups.edges, problem.row_groups.links
     of_edges = residual[:, edges.rows][np.repeat(edges.present, 2, axis=1)].sum()
-    assert freedom[0] == pytest.approx(of_edges, rel=1e-5)
+    assert freedom[EDGE_ROWS] == pytest.approx(of_edges, rel=1e-5)
     of_links = residual[:, links.rows][links.present].sum()
-    assert freedom[3] == pytest.approx(of_links, rel=1e-4, abs=1e-6)
+    assert freedom[LINK_ROWS] == pytest.approx(of_links, rel=1e-4, abs=1e-6)
     taken = sum(
         float(np.sum(piece.own**2)) + sum(float(np.sum(t**2)) for _, t in piece.shared(info.root))
         for piece in reduced_edges(info)
     )
-    assert taken == pytest.approx(weight.edges.sum() * 2 - freedom[0], rel=1e-5)
+    assert taken == pytest.approx(weight.edges.sum() * 2 - freedom[EDGE_ROWS], rel=1e-5)
 
 
 @dataclass(frozen=True)

@@ -234,7 +234,6 @@ def test_traces_are_those_of_the_hat_matrix(name):
     jac /= np.maximum(np.linalg.norm(jac, axis=0), 1e-300)
     u, s, _ = np.linalg.svd(jac, full_matrices=False)
     q = u[: k * r, s > 1e-10 * s[0]]
-    edges, poses, links = (kind.rows for kind in problem.row_groups)
     m, n = problem.layout.n_readings, problem.layout.n_equations
     pick = np.zeros((k, m, r))
     unit = np.broadcast_to(np.eye(n)[:, None], (n, k, n))
@@ -242,7 +241,7 @@ def test_traces_are_those_of_the_hat_matrix(name):
         [problem.joint_rows(row[None], state)[0] for row in unit], 0, -1
     )
     every = np.eye(k * r).reshape(k, r, k * r)
-    of = [every[:, edges], every[:, poses], pick @ every, every[:, links]]
+    of = [*(every[:, kind.rows] for kind in problem.row_groups), pick @ every]
     of = [part.reshape(-1, k * r) for part in of]
     used = problem._in_use[0].ravel()
     of = [part[np.abs(part) @ used > 0] for part in of]

@@ -190,7 +190,7 @@ def solve_batch(
         noise by more than this factor.
     """
     n_runs = start.z.shape[0]
-    ones: RowGroups[Array] = RowGroups(np.ones(n_runs), np.ones(n_runs), np.ones(n_runs))
+    ones = RowGroups(*(np.ones(n_runs) for _ in problem.row_groups))
     present = (kind.present.astype(float) for kind in problem.row_groups)
     every = RowGroups(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
     # The shading starts with the prior of a whole camera's shift: a narrow prior would make
@@ -309,10 +309,9 @@ class _Noise(NamedTuple):
         return cls(problem, fit.scale, fit.edges, problem.shading, problem.joint_noise)
 
     def with_scales(self, fit: BatchResult) -> _Noise:
-        """Update the scales of poses and links from their residuals."""
-        poses = _scale_of(fit, fit.scale.poses, POSE_ROWS)
-        links = _scale_of(fit, fit.scale.links, LINK_ROWS)
-        return self._replace(scale=RowGroups(np.ones_like(fit.scale.edges), poses, links))
+        """Update the scales of all groups but the edges from their residuals."""
+        scales = (_scale_of(fit, kind) for kind in range(POSE_ROWS, READING_ROWS))
+        return self._replace(scale=RowGroups(np.ones_like(fit.scale.edges), *scales))
 
     def with_edges(
         self, fit: BatchResult, by_tube: bool, number: int, least: Array, options: BatchOptions
@@ -476,23 +475,23 @@ def _edges(fit: BatchResult, by_tube: bool, number: int, options: BatchOptions) 
     return replace(fit.edges, scale=scale)
 
 
-def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
-    """Factor (B,) on the stated noise of poses or links that makes their chi2 equal its degrees of
+def _scale_of(fit: BatchResult, kind: int) -> Array:
+    """Factor (B,) on the stated noise of a group of rows that makes their chi2 equal its degrees of
     freedom.
 
-    scale : (B,) factor in use, unchanged where too few residuals determine it: their effective
-        number is tr M^2 with the noise's share M in their covariance
-        (:mod:`pkmcal.identify.noise`). Four cables' readings scatter more than a tracker, whose
-        poses have small shares in many residuals.
+    The factor in use is unchanged where too few residuals determine another: their effective number
+    is tr M^2 with the noise's share M in their covariance (:mod:`pkmcal.identify.noise`). Four
+    cables' readings scatter more than a tracker, whose poses have small shares in many residuals.
+
+    kind : such as POSE_ROWS.
     """
-    kinds = fit.info.problem.row_groups
-    if not (kinds.poses if kind == POSE_ROWS else kinds.links).present.any():
+    scale = fit.scale[kind]
+    if not fit.info.problem.row_groups[kind].present.any():
         return scale
-    poses, links = counts(fit.info.problem, fit.weight)[1:]
     components = fit.components
     chi2, freedom = components.chi2[:, kind], components.freedom[:, kind]
     # (tr M)^2 / n is a lower bound, which nearly always suffices
-    number = freedom**2 / np.maximum(poses if kind == POSE_ROWS else links, 1.0)
+    number = freedom**2 / np.maximum(counts(fit.info.problem, fit.weight)[kind], 1.0)
     if number.min() <= LEAST_NOISE_FREEDOM:
         number = np.sum(fit.noise_of(kind).own ** 2, axis=-1)
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))

@@ -232,8 +232,6 @@ class _Cases(NamedTuple):
             part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
         # weights in use, and losses of rejected measurements
-        pose_weight, edge_weight = problem.pose_data.weight[0], problem.data.weight[0]
-        links = problem.link_data.weight
         full = float(final_loss(np.array(NO_WEIGHT_DISTANCE)))
         losses = RowGroups(
             *(full / np.maximum(as_pairs(kind), 1e-9) ** 2 for kind in problem.row_groups)
@@ -242,7 +240,7 @@ class _Cases(NamedTuple):
         # weight, loss and configuration of each unit
         changes, loss, rows = list[_Normal](), list[float](), list[int]()
         for unit in units[:MOST_REJECTED_UNITS]:
-            weight = RowGroups(edge_weight.copy(), pose_weight.copy(), links.copy())
+            weight = RowGroups(*(kind.weight.copy() for kind in problem.row_groups))
             if not unit.is_image:
                 of_links = unit.link >= 0
                 places = assembled.places.links if of_links else assembled.places.poses
@@ -251,7 +249,7 @@ class _Cases(NamedTuple):
                 if of_links:
                     weight.links[0, row, place] = 1 / estimate.statistics.link_scale**2
                 else:
-                    weight.poses[row, place] = 1 / estimate.statistics.pose_scale**2
+                    weight.poses[0, row, place] = 1 / estimate.statistics.pose_scale**2
                 loss.append(float((losses.links if of_links else losses.poses)[row, place]))
                 rows.append(LINK_ROW if of_links else row)
             else:
@@ -259,14 +257,13 @@ class _Cases(NamedTuple):
                 own = np.flatnonzero(own & (estimate.edge_weights < INLIER_WEIGHT))
                 places = assembled.places.edges
                 row = int(places.row[own[0]])
-                weight.edges[places.row[own], places.place[own]] = 1.0
+                weight.edges[0, places.row[own], places.place[own]] = 1.0
                 loss.append(full * len(own))
                 rows.append(IMAGE_ROW)
             # change of the normal equations of its configuration
             cut = slice(row, row + 1)
             there = problem.state_among(state, cut)
-            new = RowGroups(weight.edges[None], weight.poses[None], weight.links)
-            new = problem.weighted(new).among(cut)
+            new = problem.weighted(weight).among(cut)
             changes.append(
                 _normal_equations(new, there).plus(
                     _normal_equations(problem.among(cut), there), -1.0

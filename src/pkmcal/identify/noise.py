@@ -109,8 +109,7 @@ def components(info: Information, weight: RowGroups[Array]) -> Components:
     """
     problem, sums, half = info.problem, info.by_kind, info.root
     n_readings = float(info.state.T_base_platform.shape[1] * problem.layout.n_readings)
-    edges, poses, links = counts(problem, weight)
-    count = np.stack([edges, poses, np.full(len(half), n_readings), links], axis=-1)
+    count = np.stack([*counts(problem, weight), np.full(len(half), n_readings)], axis=-1)
     kinds = np.flatnonzero(count.any(axis=0))
     shared = np.zeros(count.shape)
     covariance = half @ half.mT

@@ -165,7 +165,9 @@ class Problem:
             RowGroup(
                 slice(closures.stop, last), self.pose_blocks.present, poses.weight, poses.whiten
             ),
-            RowGroup(slice(last, None), self.link_blocks.present, links.weight, links.whiten),
+            RowGroup(
+                slice(last, self.n_rows), self.link_blocks.present, links.weight, links.whiten
+            ),
         )
 
     @property
@@ -545,13 +547,10 @@ class Problem:
     @cached_property
     def _in_use(self) -> Booleans:
         """Rows that are neither padding nor rejected, (B or 1, K, r)."""
-        edges, poses, links = (
-            np.repeat(kind.weight > 0, kind.whiten.shape[-1], axis=-1) for kind in self.row_groups
-        )
-        runs, n = max(len(edges), len(poses), len(links)), edges.shape[1]
-        parts = (edges, np.ones((1, n, self.layout.n_equations), dtype=bool), poses, links)
-        parts = [np.broadcast_to(part, (runs, n, part.shape[-1])) for part in parts]
-        return np.concatenate(parts, axis=-1)
+        out = np.ones((max(len(group.weight) for group in self.row_groups), *self.extent), bool)
+        for group in self.row_groups:
+            out[..., group.rows] = np.repeat(group.weight > 0, group.whiten.shape[-1], axis=-1)
+        return out
 
     def retract(self, state: BatchState, shared: Array, own: Array) -> BatchState:
         """Retract the state along a step, shared (B, na) and own (B, K, d).

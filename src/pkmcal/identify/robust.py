@@ -233,9 +233,8 @@ def robust_start(
     usual, _, _ = robust_cost(part, state, scaled=scaled, options=options)
     # second start: all measurements at full weight
     every = (np.broadcast_to(k.present, (len(runs), *k.present.shape)) for k in problem.row_groups)
-    one = np.ones(len(runs))
     every = RowGroups(*(p.astype(float) for p in every))
-    other = RobustStart(state, every, RowGroups(one, one, one), 0)
+    other = RobustStart(state, every, RowGroups(*(np.ones(len(runs)) for _ in every)), 0)
     poses, before = bool(problem.row_groups.poses.present.any()), np.full(len(runs), np.inf)
     for _ in range(options.most_reweightings):
         parts = zip(other.weight, other.scale, strict=True)

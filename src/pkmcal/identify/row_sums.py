@@ -16,7 +16,9 @@ from pkmcal.measurements.readings import joint_rows
 from pkmcal.solver.elimination import flat
 from pkmcal.solver.strips import Compact, Eliminated, eliminate_strips
 
-EDGE_ROWS, POSE_ROWS, READING_ROWS, LINK_ROWS = range(4)
+EDGE_ROWS, POSE_ROWS, LINK_ROWS, READING_ROWS = range(4)
+"""Kinds of rows: the groups in the order of :class:`~pkmcal.measurements.rows.RowGroups`, then the
+readings."""
 ROW_GROUPS = 4
 """Number of kinds of rows, the length of the axes of :class:`RowSums`."""
 
@@ -72,7 +74,7 @@ def row_sums(problem: Problem, state: BatchState) -> RowSums:
         if part.row_groups.edges.present.any():
             trace[:, EDGE_ROWS] += np.einsum("bcii->b", eliminated_part.own)
             normal[:, EDGE_ROWS] += eliminated_part.strips_normal
-        for kind in (POSE_ROWS, READING_ROWS, LINK_ROWS):
+        for kind in range(POSE_ROWS, ROW_GROUPS):
             own, shared, _ = _rows_of_kind(part, rows, eliminated_part, by_reading, kind)
             if shared.size:
                 trace[:, kind] += np.sum(own**2, axis=(1, 2, 3))
@@ -101,14 +103,13 @@ def _rows_of_kind(
     """
     equations, start = problem.layout.n_equations, problem.closure_rows.start
     parts = eliminated_part.q, eliminated_part.rows, rows.value[:, :, start:, None]
-    if kind in (POSE_ROWS, LINK_ROWS):
-        last = problem.row_groups.links.rows.start - start
-        cut = slice(equations, last) if kind == POSE_ROWS else slice(last, None)
-        own, shared, value = (part[:, :, cut] for part in parts)
-    else:
+    if kind == READING_ROWS:
         own, shared, value = (
             _readings(problem, part[:, :, :equations], by_reading) for part in parts
         )
+    else:
+        at = problem.row_groups[kind].rows
+        own, shared, value = (part[:, :, at.start - start : at.stop - start] for part in parts)
     return GroupRows(own, shared, value[..., 0])
 
 
@@ -121,6 +122,5 @@ def _chi2(problem: Problem, value: Array, by_reading: Array) -> Array:
     """Sums of squares (B, 4) of residuals (B, K, r), by kind."""
     closures = problem.closure_rows
     readings = _readings(problem, value[..., closures, None], by_reading)[..., 0]
-    poses, links = (value[..., kind.rows] for kind in problem.row_groups[1:])
-    parts = value[..., : closures.start], poses, readings, links
+    parts = *(value[..., group.rows] for group in problem.row_groups), readings
     return np.stack([np.sum(part**2, axis=(1, 2)) for part in parts], axis=-1)
