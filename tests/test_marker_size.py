@@ -46,7 +46,7 @@ def test_markers_are_measured_in_images(images, tmp_path):
 
 @pytest.mark.parametrize("marker", [0.015, 0.019, 0.026])
 def test_a_wrong_size_is_reported_with_the_right_one(paths, tmp_path, marker):
-    with raises(InputError, code="board.size") as caught:
+    with raises(InputError, code="board.marker_size") as caught:
         detect_boards(paths, described(tmp_path, marker))
     assert caught.value.expected.endswith(f"by marker: {marker} and square: 0.03")
     assert caught.value.found.startswith("markers 0.7")

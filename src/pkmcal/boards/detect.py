@@ -286,7 +286,7 @@ def _check_size(
         found=f"markers {share:.2f} of a square wide",
         expected=f"{marker / square:.2f}, by marker: {marker:g} and square: {square:g}",
         next_step="Measure a marker and a square with a ruler, the marker with its black border",
-        code="board.size",
+        code="board.marker_size",
     )
 
 
