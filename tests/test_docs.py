@@ -16,7 +16,9 @@ from document_keys import assert_keys
 from pkmcal.cameras import camera_models
 from pkmcal.cameras.files import load_camera
 from pkmcal.commands.cli import COMMANDS_IN_ORDER, command_named
+from pkmcal.exporters.contract import exporters
 from pkmcal.files import parse_yaml, read_json, validated_document
+from pkmcal.firmware.contract import firmwares
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
 from pkmcal.outcome.finding import templates
 from pkmcal.session.schema import session_schema
@@ -187,6 +189,22 @@ def test_options_named_exist():
         for command, rest in calls(text_of(name)):
             for option in re.findall(r"(?<!\S)--[a-z-]+", rest):
                 assert option in values(command), f"{name}: {command} {option}"
+
+
+def test_every_format_is_listed():
+    """Formats of exports and firmwares of delta printers, wherever a user reads their names."""
+    sections = re.split(r"^## ", text_of("docs/commands.md"), flags=re.MULTILINE)
+    for command, function, names in (
+        ("export", pkmcal.export, exporters()),
+        ("new", pkmcal.new, [one.name for one in firmwares()]),
+    ):
+        section = next(one for one in sections if one.startswith(f"pkmcal {command} "))
+        texts = {"the page": section, "the help": run(command, "--help").out}
+        texts["the docstring"] = function.__doc__ or ""
+        if command == "export":
+            texts["docs/export.md"] = text_of("docs/export.md").partition("\n## ")[0]
+        for place, text in texts.items():
+            assert not set(names) - set(re.findall(r"\w+", text)), f"{command}: {place}"
 
 
 @pytest.mark.parametrize("name", NAMES)
