@@ -40,7 +40,9 @@ BoardSizeTolerance = Annotated[
 ]
 PRINTED_SIZE_TOLERANCE = 1e-3
 """Default prior sigma of a printed board's size, relative. Paper expands by as much with humidity,
-and printers' feeds differ by more."""
+and printers' feeds differ by more. A board's own is the key ``tolerance`` of its file, which
+``Boards.tolerance`` and :class:`~pkmcal.measurements.Mount` hand on to the unknown ``board.size``
+(:func:`pkmcal.measurements.effects.board_sizes`)."""
 LONGEST_SQUARE_SIDE = 5.0
 """Longest side of a square or marker, m; a larger value was written in millimetres."""
 

@@ -59,7 +59,7 @@ class Boards:
 
     stations : by station number.
     body : body to which the board is fixed.
-    tolerance : prior sigma of its size, relative.
+    tolerance : prior sigma of its size, relative, as its file states.
     """
 
     stations: Mapping[int, StationBoard] = field(default_factory=dict[int, StationBoard])

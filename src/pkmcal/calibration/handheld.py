@@ -77,8 +77,9 @@ from pkmcal.wording import brief, listed
 class HandheldOptions:
     """Constants of the localization of hand-held images."""
 
-    # largest probability that any image of a session is accepted with a wrong pose (statistical)
-    misplaced: float = math.exp(-HYPOTHESIS_THRESHOLDS.report)
+    # largest probability that any image of a session is accepted with a wrong pose: 1/20, that of a
+    # false report
+    wrong_acceptance: float = math.exp(-HYPOTHESIS_THRESHOLDS.report)
     # number of an image's best poses that are always scored again when the machine is known better,
     # whatever their score by the image alone, because a wrong pose corrupts the estimate
     scored_again: int = 4
@@ -620,7 +621,7 @@ def _sure(
     """Station numbers of the images whose poses are accepted.
 
     These are the images with the smallest rival probabilities, as long as their sum stays below
-    ``HandheldOptions.misplaced``, in proportion to the images scored so far among ``count``.
+    ``HandheldOptions.wrong_acceptance``, in proportion to the images scored so far among ``count``.
 
     apart : as of :func:`_rival_probabilities`.
     """
@@ -630,7 +631,7 @@ def _sure(
     return [
         k
         for k, fault in zip(order, together, strict=True)
-        if fault < _OPTIONS.misplaced * len(hypotheses) / count
+        if fault < _OPTIONS.wrong_acceptance * len(hypotheses) / count
     ]
 
 

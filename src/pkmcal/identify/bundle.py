@@ -448,8 +448,9 @@ def _edges(fit: BatchResult, by_tube: bool, number: int, options: BatchOptions) 
 
     The single factor makes the edges' chi2 equal its degrees of freedom, with normal errors. That
     is also the optimum of the likelihood, except that rejected edges count as stated. Heavy tails
-    are not used there: they would absorb the effect of wrong readings on some edges. number : of
-    the round.
+    are not used there: they would absorb the effect of wrong readings on some edges.
+
+    number : of the round.
     """
     if by_tube:
         late = number >= options.free_rounds

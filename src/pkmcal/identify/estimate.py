@@ -37,10 +37,16 @@ class Purpose(Enum):
 class GroupStatistics(NamedTuple):
     """Statistics of a group of rows, which have one noise scale.
 
-    name : edges, poses, readings or links. scale : factor on the stated noise. chi2 : with that
-    noise. n : numbers. dof : degrees of freedom that the residuals have left. noise_range : factors
-    on the stated noise that the data allow, smallest and largest; None for edges. chance : p-value
-    of all noise being as stated; None for edges and readings.
+    name : edges, poses, readings or links.
+    scale : factor on the stated noise.
+    chi2 : with that noise.
+    n : numbers.
+    dof : degrees of freedom that the residuals have left.
+    noise_range : factors on the stated noise that the data allow, smallest and largest; None for
+        edges.
+    chance : p-value of all noise being as stated, of poses and links. None for edges, whose noise
+        is estimated tube by tube, so that ``scale`` alone is judged, and for readings, whose noise
+        is replaced where ``noise_range`` excludes the stated one.
     """
 
     name: str

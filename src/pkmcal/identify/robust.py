@@ -42,7 +42,11 @@ errors: a smaller scale would promise too much."""
 
 @dataclass(frozen=True)
 class RobustOptions:
-    """Constants of the search for a robust start."""
+    """Constants of the search for a robust start.
+
+    The width of the final weights is that of their kernel, which edges of a plot and rejections
+    share: ``FULL_WEIGHT_DISTANCE`` and ``NO_WEIGHT_DISTANCE`` of :mod:`pkmcal.solver.kernels`.
+    """
 
     # solver steps of a stage of the annealing where there are poses. Readings may be a hundred
     # times sharper than poses; the first steps are then short, and after a single refused step the

@@ -91,7 +91,13 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
 
 
 def platform_sigma(estimate: Estimate) -> float:
-    """Standard deviation of the platform's joints at given readings, root mean square, m."""
+    """Standard deviation of the platform's joints at given readings, m: root mean square over all
+    joints and over the session's poses and samples around them (:func:`platform_by_parameters`).
+
+    Refusals compare this one (:mod:`pkmcal.identify.verdict`). The verdict's headline and the
+    report have means over the session's poses of the platform's origin
+    (:attr:`ToolAccuracy.position`).
+    """
     used = estimate.state.T_base_platform[estimate.configurations]
     by = platform_by_parameters(estimate.machine, used)
     return float(np.sqrt(np.sum((by @ estimate.covariance) * by)))

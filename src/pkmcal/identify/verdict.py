@@ -47,7 +47,11 @@ ones."""
 
 @dataclass(frozen=True)
 class VerdictOptions:
-    """Limits of a result that may be used."""
+    """Limits of a result that may be used.
+
+    The platform's standard deviation is :func:`~pkmcal.identify.tool.platform_sigma`, of all its
+    joints, and not the mean at its origin that the headline has.
+    """
 
     # noise scale above which the model does not explain the measurements
     too_noisy: float = UNEXPLAINED_SCALE

@@ -1,7 +1,9 @@
 """Orientations of the platform, by an inertial sensor, an autocollimator or a vision system.
 
 Rows: :func:`pkmcal.measurements.poses.pose_rows`, the first three numbers. The positions of tracker
-and target are arbitrary, and nothing that the rows predict depends on them.
+and target are arbitrary, and nothing that the rows predict depends on them. All three angles must
+be measured; for an inclinometer, which measures two, see CONTRIBUTING ("Add a kind of
+measurement").
 """
 
 from __future__ import annotations

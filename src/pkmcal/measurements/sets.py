@@ -75,8 +75,8 @@ def of_stations(edges: Mapping[int, EdgeSet]) -> EdgeSet:
 class Mount:
     """Body to which a board or a tracker's target is fixed; its pose on the body is estimated.
 
-    tolerance : prior sigma of a board's relative size: one factor on all squares, which is
-        estimated.
+    tolerance : prior sigma of a board's relative size (``Boards.tolerance``): one factor on all
+        squares, which is estimated.
     """
 
     name: str

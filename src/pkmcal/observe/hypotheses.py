@@ -51,15 +51,15 @@ from pkmcal.outcome.hypotheses import (
     HYPOTHESIS_THRESHOLDS,
     EvidenceLevel,
     Hypothesis,
-    HypothesisOptions,
     decide,
     likely,
     posterior,
 )
 from pkmcal.wording import how_often, listed
 
-SEARCH_OPTIONS = HypothesisOptions(beam=math.inf, most=3)
-"""Selection of hypotheses whose likelihood is known by a lower bound only: the likeliest three."""
+SEARCH_OPTIONS = replace(HYPOTHESIS_THRESHOLDS, beam=math.inf, most=3)
+"""Thresholds of all decisions, with another selection of the hypotheses for the next level: the
+likeliest three, because a search finds a lower bound of a hypothesis's likelihood only."""
 OTHER_EXPLANATIONS = 4
 """Number of explanations of images other than mistakes in the readings: shifted, under other names,
 mirrored, diameters for radii."""

@@ -5,19 +5,21 @@ sentence is a template in ``sentences/AREA.toml``, with AREA the first part of t
 tests and benchmarks read codes and facts. Templates have the fields of :meth:`str.format` and these
 formats in addition:
 
-=======================  =====================================================================
-``{x:.2g mm}``           a number in m or rad, in another unit ``{x:amount m}``         the
-magnitude of a number in m or rad, two digits, in mm or degrees ``{x+unit:amount}``      the same
-for a number with its unit ``{x:brief}``            a number with two significant digits or more,
-without an exponent ``{x+s:ratio}``          the magnitude of a ratio and its standard deviation, in
-per cent ``{x+units:either .2g}`` noise of readings that are lengths (m), angles (rad) or both
-``{x:range}``            ``0.5 to 2``, or ``more than 0.5`` if the second number is None ``{x:size
-.1%}``         the magnitude of a number, in the format that follows ``{x:count edge}``       ``1
-edge``, ``12 edges`` ``{x:listed 4}``         names, of many the first; ``joined``: all of them
-``{x:one is|are}``       the first word for 1, or for a list of one ``{x:sign more|less}``   the
-first word for a positive number ``{x:case a=this|b=}``   by the value of a text ``{x:often}``
-a probability, as ``once in 30 times`` ``{x:capital}``          the beginning of a sentence
-=======================  =====================================================================
+- ``{x:.2g mm}``: a number in m or rad, in another unit
+- ``{x:amount m}``: the magnitude of a number in m or rad, two digits, in mm or degrees
+- ``{x+unit:amount}``: the same for a number with its unit
+- ``{x:brief}``: a number with two significant digits or more, without an exponent
+- ``{x+s:ratio}``: the magnitude of a ratio and its standard deviation, in per cent
+- ``{x+units:either .2g}``: noise of readings that are lengths (m), angles (rad) or both
+- ``{x:range}``: ``0.5 to 2``, or ``more than 0.5`` if the second number is None
+- ``{x:size .1%}``: the magnitude of a number, in the format that follows
+- ``{x:count edge}``: ``1 edge``, ``12 edges``
+- ``{x:listed 4}``: names, of many the first; ``joined``: all of them
+- ``{x:one is|are}``: the first word for 1, or for a list of one
+- ``{x:sign more|less}``: the first word for a positive number
+- ``{x:case a=this|b=}``: by the value of a text
+- ``{x:often}``: a probability, as ``once in 30 times``
+- ``{x:capital}``: the beginning of a sentence
 
 A part in ``[[ ]]`` is omitted if one of its facts is missing or None, and replaced by the text
 after ``||`` in the part, if there is one.

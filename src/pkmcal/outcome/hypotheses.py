@@ -190,14 +190,16 @@ def decide(
     return ranked[0] if ranked[0].log_odds > limit else None
 
 
-def likely(ranked: Sequence[Ranked[Subject]]) -> list[Ranked[Subject]]:
+def likely(
+    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = HYPOTHESIS_THRESHOLDS
+) -> list[Ranked[Subject]]:
     """Hypothesis to follow, then its rivals to be reported; empty if none is likely enough.
 
     A rival is an explanation that the first hypothesis does not exclude.
     """
-    first = decide(ranked)
-    rivals = rivals_of(ranked) if first else []
-    return [one for one in (first, *rivals) if one and one.log_odds > HYPOTHESIS_THRESHOLDS.report]
+    first = decide(ranked, options)
+    rivals = rivals_of(ranked, options) if first else []
+    return [one for one in (first, *rivals) if one and one.log_odds > options.report]
 
 
 def rivals_of(

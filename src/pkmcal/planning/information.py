@@ -157,7 +157,11 @@ class CandidateRows:
         """Standard deviations of the platform's position (m) and turn (rad) for a covariance (p,
         p).
 
-        Means over the workspace, as `calibrate` reports them.
+        Means over the workspace. A calibration's report has the median and the worst of the same in
+        its section on the workspace (:mod:`pkmcal.calibration.toolmap`), while its headline is a
+        mean over the session's own poses. A plan does not contain the terms that
+        :attr:`~pkmcal.identify.bundle.BatchResult.covariance` adds by the residuals: correlated
+        errors of edges, and undetected outliers.
         """
         variance = np.einsum("kap,pq,kaq->ka", self.work, covariance, self.work, optimize=True)
         shift, turn = variance[:, 3:].sum(axis=1), variance[:, :3].sum(axis=1)

@@ -1,7 +1,8 @@
 """Residuals over the image: a wrong camera model leaves a systematic pattern there.
 
 An edge constrains only the direction across itself, so a cell's mean shift is the least-squares
-solution of the offsets of its edges and corners along their own directions.
+solution of the offsets of its edges and corners along their own directions. The section is `field`
+in the document (`Part.name`); `viewer/src/overlay.ts` draws its shapes.
 """
 
 from __future__ import annotations

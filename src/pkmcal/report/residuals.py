@@ -1,4 +1,6 @@
-"""Report section on residuals of edges and readings, by leg, station and configuration."""
+"""Report section `residuals` on residuals of edges and readings, by leg, station and
+configuration; those over the image are :mod:`pkmcal.report.field`.
+"""
 
 from __future__ import annotations
 

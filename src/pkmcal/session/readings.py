@@ -132,7 +132,12 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
 
 
 def _check_mistakes(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Refuse readings that a mistake in whole columns explains better than their ranges do."""
+    """Refuse readings in another unit, of the wrong sign or off by one constant, by the ranges
+    (:func:`~pkmcal.mechanisms.reading_hypotheses.range_hypotheses`).
+
+    Columns that are exchanged or shifted are not decided here: images do that
+    (:mod:`pkmcal.observe.hypotheses`), or poses (:mod:`pkmcal.calibration.pose_hypotheses`).
+    """
     level = EvidenceLevel("ranges", partial(range_ratios, table.values, ranges))
     best = decide(posterior(range_hypotheses(table.values, ranges, units), [level]))
     if best is None:

@@ -5,12 +5,12 @@ Which kernel serves where:
 - `geman_mcclure_weights`, with a scale that is narrowed step by step, where a search starts far
   away and its outliers are unknown. Outliers lose their influence and inliers a part of theirs.
 - `final_weights` for the estimate itself: inliers keep all of their weight, so that covariance and
-  effective sample size are those of the clean data, and outliers have none.
+  effective sample size are those of the clean data, and outliers have none. Edges in images are
+  weighted by Student's t in addition (`pkmcal.identify.scatter.EdgeScatter.irls_weight`), because
+  the tails of their errors are estimated; `pkmcal.identify.bundle` multiplies both.
 - `cauchy_weights` where the weights start from nothing and few iterations follow, such as the
   points of one edge: the kernel keeps some weight at any distance, and so does not depend on where
   the iteration starts as the other two do.
-
-Correlated errors whose tails are estimated have weights by Student's t (`identify.scatter`).
 """
 
 from __future__ import annotations
