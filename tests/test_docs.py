@@ -26,7 +26,7 @@ from test_cli_camera import boards  # noqa: F401 - a fixture
 from test_pose_sessions import make
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), ROOT / "viewer" / "README.md"])
 PICTURES = ROOT / "docs" / "pictures"
 FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
@@ -218,6 +218,27 @@ def test_functions_named_exist(name):
         assert _exists(f"pkmcal.{first}", rest), f"{name}: {span}"
 
 
+def message_codes() -> set[str]:
+    """Codes of all sentences, and whatever in the program looks like the code of an error."""
+    package = Path(pkmcal.__file__).parent
+    areas = [path.stem for path in (package / "outcome" / "sentences").glob("*.toml")]
+    codes = {code for area in areas for code in templates(area)}
+    for path in package.rglob("*.py"):
+        codes |= set(re.findall(r'"([a-z]+\.[a-z_.]+)"', path.read_text(encoding="utf-8")))
+    return codes
+
+
+def test_answers_to_maintainers_exist():
+    """Dotted names of "Where to look": a function, the code of a finding, or a file."""
+    text = text_of("CONTRIBUTING.md").partition("\n## Where to look")[2].partition("\n## ")[0]
+    named, codes = re.findall(r"`(\w+\.[\w.]+)`", text), message_codes()
+    assert len(named) > 100
+    for span in named:
+        first, *rest = span.split(".")
+        is_code = any(code.startswith(span) for code in codes)
+        assert is_code or span.endswith(FILES) or _exists(f"pkmcal.{first}", rest), span
+
+
 def _exists(module: str, names: list[str]) -> bool:
     try:
         here = importlib.import_module(module)
@@ -230,11 +251,7 @@ def _exists(module: str, names: list[str]) -> bool:
 
 def test_codes_of_troubles_exist():
     """Codes in first cells: of a sentence, or of an error; one with an asterisk begins one."""
-    package = Path(pkmcal.__file__).parent
-    areas = [path.stem for path in (package / "outcome" / "sentences").glob("*.toml")]
-    codes = {code for area in areas for code in templates(area)}
-    for path in package.rglob("*.py"):
-        codes |= set(re.findall(r'"([a-z]+\.[a-z_.]+)"', path.read_text(encoding="utf-8")))
+    codes = message_codes()
     cells = re.findall(r"^\| (`[a-z].*?) \|", text_of("docs/troubles.md"), re.MULTILINE)
     named = re.findall(r"`([a-z_.*]+)`", " ".join(cells))
     assert len(named) > 40
