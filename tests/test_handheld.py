@@ -22,7 +22,7 @@ from pkmcal.calibration.handheld import (
     EDGES_DISAGREE_REASON,
     few_legs_reason,
     inconsistent_poses,
-    without_misplaced,
+    without_stations,
 )
 from pkmcal.calibration.localization import platform_poses, read_images
 from pkmcal.calibration.localization_cache import (
@@ -849,7 +849,7 @@ def test_an_image_in_a_wrong_place_is_found_out(breathed):
     images = read_images(session)
     scene = PriorScene.as_drawn(session, T)
     case = Case(session, images, Boards(), scene)
-    rest = without_misplaced(case, wrong, edges, estimate)
+    rest = without_stations(case, wrong, edges, estimate)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
     # the others are where the estimate has them, by the edges that it was made from
     np.testing.assert_array_equal(rest.scene.T_camera_base, T[[0, 2]])

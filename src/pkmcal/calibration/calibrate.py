@@ -37,7 +37,7 @@ from pkmcal.calibration.handheld import (
     inconsistent_poses,
     localization_share,
     localize_case,
-    without_misplaced,
+    without_stations,
 )
 from pkmcal.calibration.heights import ProbedHeights, probed_heights
 from pkmcal.calibration.image_rotation import UpsideDown, rotation_finding, upside_down
@@ -390,7 +390,7 @@ def settle(
         )
         if not wrong:
             break
-        case = without_misplaced(case, wrong, turns.measurements.edges, turns.estimate)
+        case = without_stations(case, wrong, turns.measurements.edges, turns.estimate)
     # errors that only the user can correct
     now.progress("Testing hypotheses about the data", 0.9)
     stated = refit_fixed_noise(case.session.machine, turns.measurements, turns.estimate)

@@ -690,7 +690,7 @@ def inconsistent_poses(
     }
 
 
-def without_misplaced(
+def without_stations(
     case: Case, wrong: Mapping[int, str], edges: EdgeSet, estimate: Estimate
 ) -> Case:
     """Case without some stations, with the scene of an estimate that included them.

@@ -177,8 +177,8 @@ class ToolAccuracy:
 
     @property
     def sigma(self) -> float:
-        """Root mean square of :attr:`position`, or of the legs' lengths where they do not hold the
-        platform, m.
+        """Root mean square of :attr:`position`, m, at the origin; of legs that do not hold the
+        platform, that of their lengths. For all joints see :func:`platform_sigma`.
         """
         if self.by_lengths is not None:
             return float(np.sqrt(np.sum((self.by_lengths @ self.parameters) * self.by_lengths)))
