@@ -259,7 +259,7 @@ UNASSEMBLED = (
 
 def test_simulate_refuses_a_nominal_model_that_cannot_be_assembled(tmp_path):
     nominal = drawn(tmp_path, "constant-legs", *SHORT)
-    values = run("simulate", tmp_path / "session", "--mechanism", nominal)
+    values = run("simulate", tmp_path / "session", "--machine", nominal)
     assert values.code == 2
     assert UNASSEMBLED in " ".join(values.err.split())
     assert not (tmp_path / "session").exists()
@@ -269,14 +269,14 @@ def test_simulate_refuses_a_home_far_from_any_configuration(tmp_path):
     nominal = drawn(
         tmp_path, "constant-legs", ("legs:", "home: {position: [0, 0, 5]}\nlegs:"), *SHORT
     )
-    values = run("simulate", tmp_path / "session", "--mechanism", nominal, "--json")
+    values = run("simulate", tmp_path / "session", "--machine", nominal, "--json")
     assert (values.code, values.json["code"]) == (2, "mechanism.few_configurations")
 
 
 @pytest.fixture(scope="module")
 def small_session(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drawings") / "session"
-    words = ("--mechanism", "constant-legs", "--stations", "1", "--configurations", "3")
+    words = ("--machine", "constant-legs", "--stations", "1", "--configurations", "3")
     assert run("simulate", folder, *words, "--size", "200x150").code == 0
     return folder
 

@@ -12,7 +12,7 @@ from pkmcal.ranges import GOOD_ENCODER_SIGMA, Light, Style
 
 EXAMPLES = """\
 pkmcal simulate session
-pkmcal simulate session --mechanism h4 --board --size 640x480
+pkmcal simulate session --machine h4 --board --size 640x480
 pkmcal simulate session --plan plan --joint-noise "3 um" --noise 2
 """
 
@@ -24,9 +24,10 @@ IMAGES, BOARD = "Images", "Board"
     EXAMPLES,
     argument("folder", "DIR", "New or empty folder.", Path),
     option(
-        "--mechanism", "MACHINE", "Name of a built-in machine, or mechanism file."
+        "--machine", "MACHINE", "Name of a built-in machine, or mechanism file."
         " [default: gough-stewart]", default="gough-stewart",
     ),
+    option("--mechanism", "MACHINE", "Earlier name of --machine.", hidden=True),
     number("simulate", "stations", "N", "Number of stations."),
     number("simulate", "configurations", "N", "Configurations for each station."),
     flag("--shared", "All stations observe the same configurations."),
@@ -60,13 +61,15 @@ IMAGES, BOARD = "Images", "Board"
     as_json(),
 )  # fmt: skip
 def simulate(
-    folder: Path, mechanism: str, camera: Path | None, size: str | None, as_json: bool,
-    **options: Any,
+    folder: Path, machine: str, mechanism: str | None, camera: Path | None, size: str | None,
+    as_json: bool, **options: Any,
 ) -> int:  # fmt: skip
     """Simulate a session with images and known truth."""
     import pkmcal
 
     eye = camera or (None if size is None else console.parsed_size(size))
     with console.progress(as_json) as progress:
-        result = pkmcal.simulate(folder, mechanism, camera=eye, progress=progress.report, **options)
+        result = pkmcal.simulate(
+            folder, mechanism or machine, camera=eye, progress=progress.report, **options
+        )
     return answer(result, folder, as_json=as_json)
