@@ -24,10 +24,9 @@ IMAGES, BOARD = "Images", "Board"
     EXAMPLES,
     argument("folder", "DIR", "New or empty folder.", Path),
     option(
-        "--machine", "MACHINE", "Name of a built-in machine, or mechanism file."
-        " [default: gough-stewart]", default="gough-stewart",
+        "--machine mechanism", "MACHINE", "Name of a built-in machine, or mechanism file."
+        " [default: gough-stewart]", default="gough-stewart", earlier="--mechanism",
     ),
-    option("--mechanism", "MACHINE", "Earlier name of --machine.", hidden=True),
     number("simulate", "stations", "N", "Number of stations."),
     number("simulate", "configurations", "N", "Configurations for each station."),
     flag("--shared", "All stations observe the same configurations."),
@@ -61,15 +60,13 @@ IMAGES, BOARD = "Images", "Board"
     as_json(),
 )  # fmt: skip
 def simulate(
-    folder: Path, machine: str, mechanism: str | None, camera: Path | None, size: str | None,
-    as_json: bool, **options: Any,
+    folder: Path, mechanism: str, camera: Path | None, size: str | None, as_json: bool,
+    **options: Any,
 ) -> int:  # fmt: skip
     """Simulate a session with images and known truth."""
     import pkmcal
 
     eye = camera or (None if size is None else console.parsed_size(size))
     with console.progress(as_json) as progress:
-        result = pkmcal.simulate(
-            folder, mechanism or machine, camera=eye, progress=progress.report, **options
-        )
+        result = pkmcal.simulate(folder, mechanism, camera=eye, progress=progress.report, **options)
     return answer(result, folder, as_json=as_json)
