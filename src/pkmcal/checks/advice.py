@@ -56,17 +56,13 @@ def _better_captures(forecast: Forecast | None) -> list[Finding]:
     """
     if forecast is None:
         return []
-    better = {"images.second_place": forecast.second, "images.base_board": forecast.with_board}
-    return [
-        note(
-            code,
-            number=forecast.photographs,
-            tool_sigma=position,
-            tool_sigma_before=forecast.position,
-        )
-        for code, position in better.items()
-        if position * RELEVANT_FACTOR < forecast.position
-    ]
+    before, out = forecast.position, list[Finding]()
+    if (sigma := forecast.second) * RELEVANT_FACTOR < before:
+        at = {"number": forecast.photographs, "tool_sigma": sigma, "tool_sigma_before": before}
+        out.append(note("images.second_place", **at))
+    if (sigma := forecast.with_board) * RELEVANT_FACTOR < before:
+        out.append(note("images.base_board", tool_sigma=sigma, tool_sigma_before=before))
+    return out
 
 
 def _from_one_side(inspection: Inspection) -> list[Finding]:
