@@ -237,19 +237,6 @@ def quick_plans():
         yield
 
 
-@pytest.fixture(scope="module")
-def quick_calibrations():
-    """Calibrations of the command and of Python's function, which have no such options, with few
-    imputations.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "pkmcal.api.calibrate.calibrate_session",
-            partial(calibrate_session, options=FEW_IMPUTATIONS),
-        )
-        yield
-
-
 @contextmanager
 def two_camera_models() -> Iterator[None]:
     """Calibrations of a camera, by the command and by Python's function, compare two models only:

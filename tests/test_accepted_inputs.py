@@ -200,7 +200,7 @@ def test_commands_refuse_a_calibration_of_other_types(tracker, tmp_path, key, va
     "diff CAL LOOP", "diff S/mechanism.yaml CAL -o LOOP", "export LOOP --to c",
     "export CAL --to c -o LOOP", "export CAL --to ros --session LOOP", "plan LOOP",
     "plan S --after LOOP", "plan h4 --camera LOOP", "simulate LOOP", "simulate X --plan LOOP",
-    "simulate X --mechanism LOOP", "new LOOP", "new X --machine LOOP", "new X --printer LOOP",
+    "simulate X --machine LOOP", "new LOOP", "new X --machine LOOP", "new X --printer LOOP",
     "board LOOP", "camera LOOP", "camera S/session.yaml --board LOOP", "study LOOP", "servo LOOP",
     "servo h4 --session LOOP", "view LOOP", "view S --calibration LOOP",
     "calibrate S -o LOOP", "calibrate S -o LOOP/x",

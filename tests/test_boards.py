@@ -593,30 +593,33 @@ def test_images_of_two_sizes(tmp_path, pictures):
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "facts"),
     [
-        ("type: charucco\n", "board.yaml, line 1, type: no such type of board; found charucco, "
-         "expected charuco."),
-        ("square: 0.03\n", "board.yaml, type: the board's type is missing; expected charuco or "
-         "chessboard or aruco_grid or circle_grid."),
-        (FILES["charuco"].replace("0.022", "0.04"), "board.yaml, line 4, marker: a marker of 0.04 "
-         "m does not fit into a square of 0.03 m."),
-        (FILES["charuco"].replace("5X5_100", "5X5_10"), "board.yaml, line 5, dictionary: OpenCV "
-         "has no dictionary of markers 'DICT_5X5_10'; DICT_5X5_100 comes near."),
-        (FILES["chessboard"].replace("0.03", "30"), "board.yaml, line 3, square: 30 looks like "
-         "millimetres; lengths are wanted in metres."),
-        (FILES["chessboard"].replace("corners", "corner"), "board.yaml: a chessboard needs either "
-         "corners, the inner ones, such as [7, 6], or squares, one more each way. Then look at "
-         "line 2, corner."),
-        (FILES["chessboard"].replace("[8, 5]", "[8, 2]"), "board.yaml: a chessboard needs either "
-         "corners, the inner ones, such as [7, 6], or squares, one more each way. Then look at "
-         "line 2, corners[2]."),
+        ("type: charucco\n",
+         {"where": "board.yaml, line 1, type", "found": "charucco", "expected": "charuco"}),
+        ("square: 0.03\n", {"where": "board.yaml, type",
+                            "expected": "charuco or chessboard or aruco_grid or circle_grid"}),
+        (FILES["charuco"].replace("0.022", "0.04"),
+         {"where": "board.yaml, line 4, marker", "found": "0.04 m",
+          "expected": "less than the square's 0.03 m"}),
+        (FILES["charuco"].replace("5X5_100", "5X5_10"),
+         {"where": "board.yaml, line 5, dictionary", "found": "'DICT_5X5_10'",
+          "expected": "DICT_5X5_100"}),
+        (FILES["chessboard"].replace("0.03", "30"),
+         {"where": "board.yaml, line 3, square", "found": "30", "expected": "metres"}),
+        (FILES["chessboard"].replace("corners", "corner"),
+         {"where": "board.yaml", "found": "neither corners nor squares",
+          "expected": "either corners, the inner ones, such as [7, 6], or squares, one more "
+                      "each way", "next_step": "Then look at line 2, corner"}),
+        (FILES["chessboard"].replace("[8, 5]", "[8, 2]"),
+         {"where": "board.yaml", "found": "neither corners nor squares",
+          "expected": "either corners, the inner ones, such as [7, 6], or squares, one more "
+                      "each way", "next_step": "Then look at line 2, corners[2]"}),
     ],
 )  # fmt: skip
-def test_faults_of_board_files(tmp_path, text, sentence):
-    with pytest.raises(InputError) as caught:
+def test_faults_of_board_files(tmp_path, text, facts):
+    with raises(InputError, **facts):
         board_of(tmp_path, text)
-    assert str(caught.value) == sentence
 
 
 def test_squares_or_inner_corners(tmp_path):

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from faults import raises
 from pkmcal.cameras import camera_models, load_camera
 from pkmcal.cameras.files import camera_text
 from pkmcal.errors import InputError
@@ -505,93 +506,113 @@ def test_the_parameters_of_a_file_stand_in_their_order(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("line", "instead", "sentence"),
+    ("line", "instead", "facts"),
     [
         (
             "model: pinhole",
             "model: pinhol",
-            "a.yaml, line 1, model: no such camera model; found pinhol, expected pinhole.",
+            {"where": "a.yaml, line 1, model", "found": "pinhol", "expected": "pinhole"},
         ),
         (
             "model: pinhole\n",
             "",
-            "a.yaml, model: the camera's model is missing; expected MODELS. OpenCV's files have "
-            "camera_matrix, image_width and image_height; ROS's camera_matrix; Kalibr's "
-            "camera_model under cam0.",
+            {"where": "a.yaml, model"},
         ),
         (
             "model: pinhole",
             "model: 5",
-            "a.yaml, line 1, model: no such camera model; found 5, expected MODELS.",
+            {"where": "a.yaml, line 1, model", "found": "5"},
         ),
         (
             "focal: [600, 601.5]",
             "focal: [600, -601.5]",
-            "a.yaml, line 3, focal[2]: this value cannot be used; found -601.5, "
-            "expected a number above 0.",
+            {
+                "where": "a.yaml, line 3, focal[2]",
+                "found": "-601.5",
+                "expected": "a number above 0",
+            },
         ),
         (
             "focal: [600, 601.5]",
             "focal: [6.0, 6.0]",
-            "a.yaml, line 3, focal: the focal length [6.0, 6.0] looks like millimetres; it is "
-            "wanted in pixels, which is millimetres divided by the size of a pixel in mm.",
+            {
+                "where": "a.yaml, line 3, focal",
+                "found": "[6.0, 6.0]",
+                "expected": "pixels, which is millimetres divided by the size of a pixel in mm",
+            },
         ),
         (
             "center: [319.5, 239.5]\ndistortion: [-0.2, 0.1]",
             "center: [0, 0]\ndistortion: [-90, 0]",
-            "a.yaml: the camera has no ray in the middle of its image; found image_size "
-            "[640, 480], and lens numbers by which no ray of light ends there, expected focal, "
-            "center and distortion of images of this size.",
+            {
+                "where": "a.yaml",
+                "found": "image_size [640, 480], and lens numbers by which no ray of light ends "
+                "there",
+                "expected": "focal, center and distortion of images of this size",
+            },
         ),
         (
             "center: [319.5, 239.5]\n",
             "",
-            "a.yaml, center: this is missing; expected [cx, cy] in pixels, pixel centres at "
-            "integers.",
+            {
+                "where": "a.yaml, center",
+                "expected": "[cx, cy] in pixels, pixel centres at integers",
+            },
         ),
         (
             "distortion: [-0.2, 0.1]",
             "distortion: [1, 2, 3, 4, 5, 6, 7, 8]",
-            "a.yaml, line 5, distortion: this has too many entries; "
-            "found 8 entries, expected at most 5.",
+            {"where": "a.yaml, line 5, distortion", "found": "8 entries", "expected": "at most 5"},
         ),
         (
             "[640, 480]",
             "[640.5, 480]",
-            "a.yaml, line 2, image_size[1]: this value cannot be used; found 640.5, "
-            "expected a whole number.",
+            {
+                "where": "a.yaml, line 2, image_size[1]",
+                "found": "640.5",
+                "expected": "a whole number",
+            },
         ),
         (
             "[640, 480]",
             "640x480",
-            "a.yaml, line 2, image_size: this value cannot be used; found '640x480', "
-            "expected a list, such as [1, 2, 3].",
+            {
+                "where": "a.yaml, line 2, image_size",
+                "found": "'640x480'",
+                "expected": "a list, such as [1, 2, 3]",
+            },
         ),
         (
             "[640, 480]",
             "[640]",
-            "a.yaml, line 2, image_size: this has too few entries; found [640], "
-            "expected [width, height] in pixels.",
+            {
+                "where": "a.yaml, line 2, image_size",
+                "found": "[640]",
+                "expected": "[width, height] in pixels",
+            },
         ),
         (
             "center:",
             "centre:",
-            "a.yaml, line 4, centre: this key is not known; found centre, expected center "
-            "(known here: center, covariance, distortion, focal, image_size, model).",
+            {
+                "where": "a.yaml, line 4, centre",
+                "found": "centre",
+                "expected": "center (known here: center, covariance, distortion, focal, "
+                "image_size, model)",
+            },
         ),
         (
             "239.5",
             ".nan",
-            "a.yaml, line 4, center[2]: this is not a finite number; found nan, expected a number.",
+            {"where": "a.yaml, line 4, center[2]", "found": "nan", "expected": "a number"},
         ),
     ],
 )
-def test_faults_of_camera_files(tmp_path, line, instead, sentence):
+def test_faults_of_camera_files(tmp_path, line, instead, facts):
     assert line in GOOD
     (tmp_path / "a.yaml").write_text(GOOD.replace(line, instead, 1))
-    with pytest.raises(InputError) as caught:
+    with raises(InputError, **facts):
         load_camera(tmp_path / "a.yaml")
-    assert str(caught.value) == sentence.replace("MODELS", " or ".join(sorted(camera_models())))
 
 
 def test_a_changed_aspect_leaves_the_mean_focal_length(case):

@@ -15,17 +15,11 @@ import yaml
 from conftest import run
 from faults import raises
 from pkmcal.api.check import CheckResult
+from pkmcal.calibration.localization import platform_poses, read_images
 from pkmcal.checks import advice as words
 from pkmcal.checks.check import check_session
-from pkmcal.checks.forecast import (
-    A4_BOARD,
-    Forecast,
-    LegForecast,
-    _Capture,
-    _capture_information,
-    _with_base_board,
-    forecast,
-)
+from pkmcal.checks.forecast import A4_BOARD, Forecast, LegForecast, forecast
+from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.checks.pictures import (
     CAPTION_BAR_HEIGHT,
     PANE_GAP,
@@ -42,10 +36,16 @@ from pkmcal.identify.tool import centres_and_tool
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.images import binned
 from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.quality import quality
 from pkmcal.outcome import Level
-from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.default_camera import camera_of_size, default_camera
+from pkmcal.placement.stations import StationPose
 from pkmcal.planning.first import EdgesOf
-from pkmcal.planning.rig import LegsFrom, Rig, nominal_pools
+from pkmcal.planning.rig import At, BoardFrom
+from pkmcal.session.load import load_session
+from pkmcal.simulation import Settings
+from pkmcal.simulation.truth import load_truth
+from rendered import rendered
 
 
 @pytest.fixture
@@ -104,39 +104,60 @@ def by_hand(look, count):
     return replace(look, session=session, stations=tuple(parts[:count]))
 
 
-def test_the_forecast_of_images_by_hand(checked_session):
+def test_the_forecast_of_images_by_hand(checked_session, tmp_path):
     """Each has a pose of its own, so they give less than as many on tripods."""
     look = checked_session.look
     four, six = forecast(by_hand(look, 4)), forecast(by_hand(look, 6))
     assert (four.handheld, four.photographs, six.photographs) == (True, 4, 6)
     assert six.position < four.position
-    assert six.with_board <= six.position
     assert {(leg.station, leg.leg) for leg in six.legs} == {("phone", j) for j in range(1, 7)}
     assert sum(leg.tells for leg in six.legs) == pytest.approx(1)
     assert six.position > forecast(look, 2).position
+    assert six.with_board <= six.position
     useful = replace(six, with_board=six.position / 2)
     codes = [{one.code for one in words.advice(by_hand(look, 6), one)} for one in (six, useful)]
     assert ["images.base_board" in some for some in codes] == [False, True]
 
 
-def test_a_board_on_the_base_stands_still_and_locates_the_cameras():
+def test_a_board_on_the_base_locates_the_cameras(tmp_path):
+    """From above, where a flat board is in view; a session that has it has the same forecast."""
+    places = tuple(
+        StationPose(eye, (0.0, 0.0, 0.1))
+        for eye in ((0.7, 0.3, 0.9), (-0.5, 0.6, 0.9), (0.2, -0.8, 0.9))
+    )
+    settings = Settings(stations=places, configurations=2, tolerance=0.0, finish="matte")
+    folder, machine = tmp_path / "session", load_mechanism("gough-stewart")
+    rendered(folder, machine, camera_of_size((640, 480)), settings, seed=7)
+    session = load_session(folder)
+    T_camera_base, poses = load_truth(folder, machine).T_camera_base, platform_poses(session)
+    stations = tuple(
+        StationInspection(str(images.station), images, None, T, quality(images, machine, T, own))
+        for images, T in zip(read_images(session), T_camera_base, strict=True)
+        for own in [poses[images.configuration]]
+    )
+    look = by_hand(Inspection(session, poses, stations), 6)
+    alone = forecast(look)
+    assert alone.with_board < 0.9 * alone.position
+    (tmp_path / "board.yaml").write_text(yaml.safe_dump(A4_BOARD.document))
+    session = replace(look.session, board=tmp_path / "board.yaml", board_body="base")
+    on_base = forecast(replace(look, session=session))
+    assert on_base.position == alone.with_board
+    assert np.isnan(on_base.with_board)
+
+
+def test_a_board_on_the_base_stands_still():
     machine, camera = load_mechanism("gough-stewart"), default_camera()
     poses = np.tile(machine.home(), (3, 1, 1))
     poses[:, 2, 3] += [-0.02, 0.0, 0.02]
-    eyes = ([0.7, 0.3, 0.9], [-0.5, 0.6, 0.9], [0.2, -0.8, 0.9])
-    T = np.stack([look_at(np.array(eye), np.zeros(3), np.eye(3)[2]) for eye in eyes])
-    legs = tuple(LegsFrom(k, camera, T[k], nominal_pools(machine)) for k in range(3))
-    rig = Rig(machine, ("a", "b", "c"), T, np.zeros(3, dtype=int), 1e-5, legs)
-    joints, pairs = machine.inverse(poses), np.stack([np.arange(3)] * 2, axis=-1)
-    board = _with_base_board(rig, A4_BOARD)
-    seen = board.measured(joints, poses, pairs).poses
-    assert seen.station.tolist() == [0, 1, 2]
-    T_base_board = inverse(T) @ seen.T_station_target
-    np.testing.assert_allclose(T_base_board, T_base_board[:1].repeat(3, axis=0), atol=1e-12)
-    one, other = (
-        _capture_information(_Capture(some, poses, joints, pairs)).position for some in (rig, board)
+    at = At(machine, machine.inverse(poses), poses)
+    T_camera_base = look_at(np.array([0.7, 0.3, 0.9]), np.zeros(3), np.eye(3)[2])
+    T_base_board = pose(rotation(np.array([np.pi, 0.0, 0.0])), np.array([-0.1, 0.05, 0.0]))
+    board = BoardFrom(0, camera, T_camera_base, A4_BOARD.points, T_base_board, on_platform=False)
+    measured = board.measure(at, np.arange(3), None)
+    assert measured.configuration.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(
+        inverse(T_camera_base) @ measured.T_station_target, np.stack([T_base_board] * 3), atol=1e-12
     )
-    assert other < 0.9 * one
 
 
 def test_more_images_reduce_the_forecast(checked_session):
@@ -212,13 +233,13 @@ def test_an_uninformative_leg_is_named_with_its_reason(visible, checked_session,
 
 
 def test_a_second_place_is_advised_where_it_is_worth_it(checked_session):
-    values = replace(checked_session.forecast, position=2e-4, second=1e-4)
-    (text,) = words._second_station(values)
-    assert text.code == "images.second_place"
-    assert (text.facts["tool_sigma"], text.facts["tool_sigma_before"]) == (1e-4, 2e-4)
-    assert text.facts["number"] == 15
-    assert words._second_station(replace(values, second=1.8e-4)) == []
-    assert words._second_station(replace(values, second=float("nan"))) == []
+    def advised(second):
+        values = replace(checked_session.forecast, position=2e-4, second=second)
+        findings = words.advice(checked_session.look, values)
+        return [one.facts for one in findings if one.code == "images.second_place"]
+
+    assert advised(1e-4) == [{"number": 15, "tool_sigma": 1e-4, "tool_sigma_before": 2e-4}]
+    assert advised(1.8e-4) == advised(float("nan")) == []
 
 
 def test_stations_on_one_side_are_reported(checked_session):

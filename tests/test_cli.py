@@ -604,7 +604,7 @@ def test_simulate(tmp_path):
 
 
 def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
-    words = ("--mechanism", demo.session / "mechanism.yaml", "--stations", 1)
+    words = ("--machine", demo.session / "mechanism.yaml", "--stations", 1)
     camera = demo.session / "cameras" / "camera.yaml"
     done = run("simulate", tmp_path / "s", *words, "--configurations", 2, "--camera", camera)
     assert done.code == 0
@@ -618,8 +618,8 @@ def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
         ("--size", "large", {"where": "--size", "found": "large"}),
         ("--joint-noise", "0", {"where": "--joint-noise", "found": "0"}),
         ("--joint-noise", "nan", {"where": "--joint-noise", "found": "nan"}),
-        ("--mechanism", "gough-stuart", {"found": "gough-stuart", "expected": "gough-stewart"}),
-        ("--mechanism", "mine.yaml", {"code": "file.missing", "where": "mine.yaml"}),
+        ("--machine", "gough-stuart", {"found": "gough-stuart", "expected": "gough-stewart"}),
+        ("--machine", "mine.yaml", {"code": "file.missing", "where": "mine.yaml"}),
         ("--camera", "eye.yaml", {"code": "file.missing", "where": "eye.yaml"}),
         ("--stations", "0", {"where": "--stations", "found": "0"}),
     ],
@@ -668,7 +668,7 @@ def test_usage_errors(words, message):
     [
         (["servo", "gough"], "expected gough-stewart."),
         (["study", "stewart"], "expected gough-stewart."),
-        (["simulate", "DIR/new", "--mechanism", "four"], "expected four-belt."),
+        (["simulate", "DIR/new", "--machine", "four"], "expected four-belt."),
         (["calibrate", "DIR/sesion"], "There is DIR/session."),
         (["calibrate", "DIR/nothing-like-it"], "there is no such session folder.\n"),
     ],

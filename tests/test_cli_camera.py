@@ -89,7 +89,7 @@ def test_missing_files_are_reported(boards, tmp_path):
     cases = {
         ("camera", tmp_path / "nowhere"): ("file.missing", tmp_path / "nowhere"),
         ("camera", tmp_path): ("images.none", tmp_path),
-        ("camera", boards, "--board", tmp_path / "b.yaml"): ("file.missing", "b.yaml"),
+        ("camera", boards, "--board", tmp_path / "b.yaml"): ("file.missing", tmp_path / "b.yaml"),
     }
     for words, (code, where) in cases.items():
         done = run(*words, "-o", tmp_path / "out", "--json")

@@ -14,6 +14,7 @@ import printers
 from conftest import run
 from dialects import HEIGHT_OFFSET, carried, commands, marlin, perturbed
 from export_sources import source_of
+from faults import raises
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
 from pkmcal.exporters.delta import read_firmware_from_base
@@ -525,40 +526,116 @@ def test_a_firmware_is_named_for_a_printer():
 
 
 WRONG = {
-    OLDEST: "the height at home is not among these values",
-    changed(M503, "Y0.0000 Z-1.5", "Y0.5000 Z-1.5"): "an end switch's offset, M666,",
-    changed(M503, "R105.0000", "R-105"): "M665 R is no number",
-    changed(M503, "R105.0000", "Rnan"): "a value of this line is no number",
-    changed(M503, "R105.0000", "R1e999"): "a value of this line is no number",
-    changed(M503, "R105.0000", "R10:5"): "a value of this line is no number",
-    changed(M503, "R105.0000", "R300"): "a rod has to be longer",
-    changed(M503, "L270.0000", ""): "M665 has no value L",
-    changed(M503, "M92 X80.00", "M92 X0"): "M92 X is no number",
-    changed(M503, "G21", "G20"): "these values are in inches",
-    M503 + "echo:  M206 X1.00 Y0.00 Z0.00\n": "M206 X is no number",
-    changed(CONFIGURATION, "#define DELTA_HEIGHT 284.00", ""): "is missing: DELTA_HEIGHT",
-    CONFIGURATION + "#define DELTA_HEIGHT 285.00\n": "DELTA_HEIGHT is defined twice",
-    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR DELTA_RADIUS"): "is no number",
-    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR " + 900 * "("): "is no number",
-    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR " + 200_000 * "("): "is no number",
-    changed(CONFIGURATION, "#define DELTA\n", "#if ENABLED(DELTA)\n"): "is not of a delta",
-    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR 1/0"): "is no number",
-    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR 9**9**9"): "is no number",
-    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR exit()"): "is no number",
-    changed(CONFIGURATION, "EFFECTOR 30.0", "OTHER 30.0"): "is missing: EFFECTOR",
-    changed(CONFIGURATION, "//#define DELTA_RADIUS_TRIM", "#define DELTA_RADIUS_TRIM"):
-        "towers on circles of their own",
-    changed(CONFIGURATION, "{ -0.25, 0.0, -1.5 }", "{ 0.5, 0.0, -1.5 }"): "an end switch's offset",
-    changed(CONFIGURATION, "{ -0.25, 0.0, -1.5 }", "-1"): "one number for each tower",
-    changed(CONFIGURATION, "{ 80, 80, 100, 412.99 }", "{ 80, -80, 100 }"): "STEPS_PER_UNIT is no",
-}  # fmt: skip
+    OLDEST: {"where": "printer.txt, line 2", "found": "M665 without H, as Marlin 1.1.0 prints it"},
+    changed(M503, "Y0.0000 Z-1.5", "Y0.5000 Z-1.5"): {
+        "where": "printer.txt, line 6",
+        "found": "0.5",
+        "expected": "at most 0, as Marlin takes it",
+    },
+    changed(M503, "R105.0000", "R-105"): {
+        "where": "printer.txt, line 8",
+        "found": "-105",
+        "expected": "above 0",
+    },
+    changed(M503, "R105.0000", "Rnan"): {
+        "where": "printer.txt, line 8",
+        "found": "'M665 L270.0000 Rnan H284.0000 S200.0000 X0.2000 Y-0.1000 Z…",
+    },
+    changed(M503, "R105.0000", "R1e999"): {
+        "where": "printer.txt, line 8",
+        "found": "'M665 L270.0000 R1e999 H284.0000 S200.0000 X0.2000 Y-0.1000…",
+    },
+    changed(M503, "R105.0000", "R10:5"): {
+        "where": "printer.txt, line 8",
+        "found": "'M665 L270.0000 R10:5 H284.0000 S200.0000 X0.2000 Y-0.1000 …",
+    },
+    changed(M503, "R105.0000", "R300"): {
+        "where": "printer.txt",
+        "found": "rods of 269.8 mm, a radius of 300 mm",
+        "expected": "both in mm, as the firmware has them",
+    },
+    changed(M503, "L270.0000", ""): {
+        "where": "printer.txt",
+        "expected": "the line M665 that M503 prints, with L, R and H",
+    },
+    changed(M503, "M92 X80.00", "M92 X0"): {
+        "where": "printer.txt, line 4",
+        "found": "0",
+        "expected": "above 0",
+    },
+    changed(M503, "G21", "G20"): {"where": "printer.txt, line 2", "expected": "G21, millimetres"},
+    M503 + "echo:  M206 X1.00 Y0.00 Z0.00\n": {
+        "where": "printer.txt, line 14",
+        "found": "1",
+        "expected": "0",
+    },
+    changed(CONFIGURATION, "#define DELTA_HEIGHT 284.00", ""): {
+        "where": "printer.txt",
+        "expected": "#define DELTA_HEIGHT with a number",
+    },
+    CONFIGURATION + "#define DELTA_HEIGHT 285.00\n": {
+        "where": "printer.txt, lines 10 and 19",
+        "found": "'284.00' and '285.00'",
+        "expected": "one definition",
+    },
+    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR DELTA_RADIUS"): {
+        "where": "printer.txt, line 9",
+        "found": "'((DELTA_SMOOTH_ROD_OFFSET)-(EFFECTOR)-25)'",
+    },
+    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR " + 900 * "("): {
+        "where": "printer.txt, line 8",
+        "found": "'((((((((((((((((((((((((((((((((((((((((((((((((((((((((((…",
+    },
+    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR " + 200_000 * "("): {
+        "where": "printer.txt, line 8",
+        "found": "'((((((((((((((((((((((((((((((((((((((((((((((((((((((((((…",
+    },
+    changed(CONFIGURATION, "#define DELTA\n", "#if ENABLED(DELTA)\n"): {
+        "where": "printer.txt",
+        "found": "'#if ENABLED(DELTA)' without #define DELTA",
+        "expected": "#define DELTA",
+    },
+    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR 1/0"): {
+        "where": "printer.txt, line 8",
+        "found": "'1/0'",
+    },
+    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR 9**9**9"): {
+        "where": "printer.txt, line 8",
+        "found": "'9**9**9'",
+    },
+    changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR exit()"): {
+        "where": "printer.txt, line 8",
+        "found": "'exit()'",
+    },
+    changed(CONFIGURATION, "EFFECTOR 30.0", "OTHER 30.0"): {
+        "where": "printer.txt",
+        "expected": "#define EFFECTOR with a number",
+    },
+    changed(CONFIGURATION, "//#define DELTA_RADIUS_TRIM", "#define DELTA_RADIUS_TRIM"): {
+        "where": "printer.txt, line 14",
+        "found": "1, 2, 3 mm",
+    },
+    changed(CONFIGURATION, "{ -0.25, 0.0, -1.5 }", "{ 0.5, 0.0, -1.5 }"): {
+        "where": "printer.txt, line 12",
+        "found": "0.5",
+        "expected": "at most 0, as Marlin takes it",
+    },
+    changed(CONFIGURATION, "{ -0.25, 0.0, -1.5 }", "-1"): {
+        "where": "printer.txt, line 12",
+        "found": "'-1'",
+    },
+    changed(CONFIGURATION, "{ 80, 80, 100, 412.99 }", "{ 80, -80, 100 }"): {
+        "where": "printer.txt, line 18",
+        "found": "-80",
+        "expected": "above 0",
+    },
+}
 
 
-@pytest.mark.parametrize("text", WRONG, ids=WRONG.values())
+@pytest.mark.parametrize("text", WRONG, ids=[facts["where"] for facts in WRONG.values()])
 def test_what_marlin_has_not_is_refused(text, tmp_path):
-    with pytest.raises(InputError) as caught:
+    with raises(InputError, **WRONG[text]):
         read_printer(text_file(tmp_path, text))
-    assert WRONG[text] in str(caught.value)
 
 
 @pytest.mark.parametrize(

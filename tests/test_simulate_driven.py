@@ -290,7 +290,7 @@ def test_hinges_of_side_bars_cannot_be_drawn(tmp_path):
 
 def test_the_command_writes_cylinders_into_the_sessions_nominal_model(tmp_path):
     done = run(
-        "simulate", tmp_path / "s", "--mechanism", "h4", "--stations", "1", "--configurations", "2",
+        "simulate", tmp_path / "s", "--machine", "h4", "--stations", "1", "--configurations", "2",
         "--size", "96x72",
     )  # fmt: skip
     assert done.code == 0
@@ -412,7 +412,7 @@ def test_a_home_that_a_limb_does_not_reach_is_reported_with_its_file(tmp_path):
     text = mechanism_text(load_mechanism("6-rus"))
     path = tmp_path / "short.yaml"
     path.write_text(re.sub(r"constant: [\d.]+", "constant: 0.01", text, count=1))
-    result = run("simulate", str(tmp_path / "out"), "--mechanism", str(path), "--size", "64x64")
+    result = run("simulate", str(tmp_path / "out"), "--machine", str(path), "--size", "64x64")
     values = " ".join((result.out + result.err).split())
     assert result.code == 2
     assert "short.yaml: mechanism '6-rus' cannot take its home pose: joint 1 cannot reach" in values

@@ -513,7 +513,7 @@ def of_two_stations(session):
 
 
 @pytest.fixture(scope="module")
-def saved_result(demo, quick_calibrations, tmp_path_factory):
+def saved_result(demo, tmp_path_factory):
     """Two of the demonstration's stations calibrated without three configurations, and
     validated.
     """

@@ -53,7 +53,7 @@ class Case:
 
 
 @pytest.fixture(scope="module")
-def work(tmp_path_factory, boards, quick_calibrations, quick_cameras):  # noqa: F811 - the fixture
+def work(tmp_path_factory, boards, quick_cameras):  # noqa: F811 - the fixture
     """Two sessions of a machine by a tracker, a calibration of the first, images of a board, a new
     session, and a printer's file.
     """

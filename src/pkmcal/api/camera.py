@@ -127,4 +127,7 @@ def _images_and_board(
     else:
         paths = image_files(given)
         there = None if board is not None else board_file_of(given)
-    return paths, board if isinstance(board, Board) else load_board(board or there or "")
+    if isinstance(board, Board):
+        return paths, board
+    file = board or there or ""
+    return paths, load_board(file, label=str(file))

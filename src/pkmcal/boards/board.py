@@ -22,6 +22,7 @@ from pkmcal.boards.kalibr import board_fields, is_kalibr_target
 from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
+    FieldError,
     Metres,
     Schema,
     Share,
@@ -57,17 +58,17 @@ class _Dictionary(Schema):
     def _check_dictionary(cls, name: str) -> str:
         if name in dictionaries():
             return name
-        guess = closest(name, dictionaries())
-        raise ValueError(
-            f"OpenCV has no dictionary of markers {quoted(name)}"
-            + (f"; {guess} comes near" if guess else "")
+        raise FieldError(
+            "OpenCV has no such dictionary of markers",
+            found=quoted(name),
+            expected=closest(name, dictionaries()),
         )
 
 
 def _metres(length: float) -> float:
-    """Length if plausible in metres; raises ValueError beyond LONGEST_SQUARE_SIDE."""
+    """Length if plausible in metres; raises FieldError beyond LONGEST_SQUARE_SIDE."""
     if length > LONGEST_SQUARE_SIDE:
-        raise ValueError(f"{length:g} looks like millimetres; lengths are wanted in metres")
+        raise FieldError("this looks like millimetres", found=f"{length:g}", expected="metres")
     return length
 
 
@@ -88,7 +89,11 @@ class CharucoSchema(_Dictionary):
     def _in_metres(cls, length: float, info: ValidationInfo) -> float:
         square = info.data.get("square")
         if square is not None and length >= square:
-            raise ValueError(f"a marker of {length:g} m does not fit into a square of {square:g} m")
+            raise FieldError(
+                "a marker does not fit into its square",
+                found=f"{length:g} m",
+                expected=f"less than the square's {square:g} m",
+            )
         return _metres(length)
 
 
@@ -106,9 +111,11 @@ class ChessboardSchema(Schema):
     def _one_of_two(cls, squares: Counts | None, info: ValidationInfo) -> Counts | None:
         corners = info.data.get("corners")
         if (corners is None) == (squares is None):
-            raise ValueError(
-                "a chessboard needs either corners, the inner ones, such as [7, 6], or squares,"
-                " one more each way"
+            raise FieldError(
+                "a chessboard has one count of its pattern",
+                found="neither corners nor squares" if squares is None else "corners and squares",
+                expected="either corners, the inner ones, such as [7, 6], or squares, one more each"
+                " way",
             )
         return squares
 

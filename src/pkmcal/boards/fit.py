@@ -26,7 +26,6 @@ from pkmcal.solver.elimination import Linear, eliminate
 from pkmcal.solver.kernels import final_weights
 from pkmcal.solver.ranks import NORMAL_RANK_TOLERANCE, normal_root
 from pkmcal.solver.search import Stop, Values, minimise
-from pkmcal.solver.strips import compact
 
 MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
 """Median length of a vector of two normal numbers, in their standard deviation."""
@@ -122,17 +121,16 @@ class CameraProblem:
         there = apply(state.T_camera_board[..., None, :, :], self.points)
         off = (camera.project(there) - self.pixels) * self.scale[..., None]
         off = np.where(self.scale[..., None] > 0, off, 0.0)
-        value = off.reshape(*off.shape[:2], -1)
-        return Values(value, np.zeros((len(off), 0)), lambda: compact(self.linearize(state, value)))
+        return Values(off.reshape(*off.shape[:2], -1), np.zeros((len(off), 0)))
 
-    def linearize(self, state: CameraState, value: Array | None = None) -> Linear:
-        """Whitened residuals and their exact derivatives; value : the residuals, if known."""
+    def linearize(self, state: CameraState) -> Linear:
+        """Whitened residuals and their exact derivatives."""
         camera = with_free(self.camera, self.free, state)
         rotated = apply(state.T_camera_board[..., None, :, :], self.points)
         turned = rotated - state.T_camera_board[..., None, :3, 3]
         by_point, by_parameters = camera.project_jacobians(rotated)
         by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
-        value = self.residuals(state).value if value is None else value
+        value = self.residuals(state).value
         usable = np.isfinite(value)
         shape = value.shape
         scale = self.scale[..., None, None]

@@ -20,6 +20,7 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import (
+    BOARD_MOUNT_NAME,
     EdgeSet,
     LinkSet,
     Measurements,
@@ -203,7 +204,7 @@ def measurements_of(
         evaluated; None for the nominal ones.
     """
     # Mounts: the board, then each tracker's target, then the points of links.
-    mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
+    mounts = [Mount(BOARD_MOUNT_NAME, boards.body, boards.tolerance)] if boards.stations else []
     poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
     # Changes of the cameras so far: poses are transformed to first order.
     focal_at = np.zeros(0)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,14 +23,13 @@ from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
-Result = TypeVar("Result")
 SESSION_FILE = "session.yaml"
 """File that identifies a session's folder."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MachineSource:
-    """A machine to export or to control, with its uncertainty.
+    """A machine to export or to control, with its uncertainty; equal to itself only.
 
     machine : with the values to use.
     sigma, covariance : (P,) and (P, P) of its parameters; None for a nominal model.
@@ -71,15 +69,6 @@ class MachineSource:
     bed_by_parameters: Array | None = None
     bed_sigma: float | None = None
     session: str = ""
-    _results: dict[Hashable, Any] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
-
-    def once(self, key: Hashable, compute: Callable[[], Result]) -> Result:
-        """Result of a computation from this source alone, which is retained under ``key``."""
-        if key not in self._results:
-            self._results[key] = compute()
-        return self._results[key]
 
     @property
     def identity(self) -> str:

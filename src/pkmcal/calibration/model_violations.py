@@ -36,7 +36,7 @@ from pkmcal.identify.score import (
     ScoreTests,
 )
 from pkmcal.identify.tool import ToolAccuracy, tool_error
-from pkmcal.measurements import Column, Measurements, Observation
+from pkmcal.measurements import BOARD_MOUNT_NAME, Column, Measurements, Observation
 from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms import machine_from_document
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
@@ -440,7 +440,7 @@ def _boards(
     """Sizes of the boards."""
     del observation, estimate
     for m, mount in enumerate(measured.mounts):
-        if mount.name == "board":
+        if mount.name == BOARD_MOUNT_NAME:
             from pkmcal.boards.poses import board_size_column
 
             yield board_size_column(measured.poses, m, session.document["board"]["file"])

@@ -43,7 +43,7 @@ from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import identified
 from pkmcal.identify.verdict import VERDICT, RicherModel
 from pkmcal.levels import LARGEST_NOMINAL_ERROR, NEARLY_ALL
-from pkmcal.measurements import Measurements
+from pkmcal.measurements import BOARD_MOUNT_NAME, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
 from pkmcal.outcome.finding import Finding, note
@@ -635,7 +635,7 @@ def _sizes(
 ) -> Iterator[PoseHypothesis]:
     """Another size of the board's squares: all of its distances are wrong by one factor."""
     poses = measurements.poses
-    boards = [m for m, mount in enumerate(measurements.mounts) if mount.name == "board"]
+    boards = [m for m, mount in enumerate(measurements.mounts) if mount.name == BOARD_MOUNT_NAME]
     rows = np.flatnonzero(np.isin(poses.mount, boards) & measurements.on_platform[poses.mount])
     if not boards or len(rows) < 2 * FEWEST_BESIDE_MOVEMENT:
         return

@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.files import MOST_PIXELS, Schema
+from pkmcal.files import MOST_PIXELS, FieldError, Schema
 from pkmcal.geometry.rigid import dot, of_components
 
 PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
@@ -61,7 +61,7 @@ class CameraSchema(Schema):
     def _of_some_pixels(cls, size: tuple[int, int]) -> tuple[int, int]:
         """Check the number of pixels."""
         if (pixels := size[0] * size[1]) > MOST_PIXELS:
-            raise ValueError(f"too many pixels; found {pixels}, expected at most {MOST_PIXELS}")
+            raise FieldError("too many pixels", found=pixels, expected=f"at most {MOST_PIXELS}")
         return size
 
     @field_validator("focal")
@@ -70,19 +70,22 @@ class CameraSchema(Schema):
         """Check that focal lengths are in pixels, by the field of view, and alike."""
         width = info.data.get("image_size", (0, 0))[0]
         if min(focal) < LEAST_FOCAL * width:
-            raise ValueError(
-                f"the focal length {list(focal)} looks like millimetres; it is wanted in pixels, "
-                "which is millimetres divided by the size of a pixel in mm"
+            raise FieldError(
+                "the focal length looks like millimetres",
+                found=list(focal),
+                expected="pixels, which is millimetres divided by the size of a pixel in mm",
             )
         if width and max(focal) > MOST_FOCAL * width:
-            raise ValueError(
-                f"no lens has this focal length; found {max(focal):g}, expected at most"
-                f" {MOST_FOCAL:g} times the image's width of {width}"
+            raise FieldError(
+                "no lens has this focal length",
+                found=f"{max(focal):g}",
+                expected=f"at most {MOST_FOCAL:g} times the image's width of {width}",
             )
         if max(focal) > MOST_ASPECT * min(focal):
-            raise ValueError(
-                f"the two focal lengths differ too much; found {list(focal)}, expected a ratio of"
-                f" at most {MOST_ASPECT:g}"
+            raise FieldError(
+                "the two focal lengths differ too much",
+                found=list(focal),
+                expected=f"a ratio of at most {MOST_ASPECT:g}",
             )
         return focal
 
@@ -97,9 +100,11 @@ class CameraSchema(Schema):
             return center
         if all(-0.5 <= c <= n - 0.5 for c, n in zip(center, size, strict=True)):
             return center
-        raise ValueError(
-            f"the principal point lies outside the image; found {list(center)}, expected a point"
-            f" in {size[0]}x{size[1]} pixels, the size of the images that were calibrated"
+        raise FieldError(
+            "the principal point lies outside the image",
+            found=list(center),
+            expected=f"a point in {size[0]}x{size[1]} pixels, the size of the images that were"
+            " calibrated",
         )
 
 

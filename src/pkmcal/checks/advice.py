@@ -39,8 +39,7 @@ LEG_COLUMNS = {
 def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, ...]:
     """Advice for a session, the most useful first."""
     out = [
-        *_second_station(forecast),
-        *_base_board(forecast),
+        *_better_captures(forecast),
         *_from_one_side(inspection),
         *_hidden_legs(inspection),
         *_slim_tubes(inspection),
@@ -51,31 +50,19 @@ def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, 
     return tuple(out)
 
 
-def _second_station(forecast: Forecast | None) -> list[Finding]:
-    """Advice to use a second station, if it gains more than further images at the only one."""
-    if forecast is None or not forecast.second * RELEVANT_FACTOR < forecast.position:
+def _better_captures(forecast: Forecast | None) -> list[Finding]:
+    """Advice to use a second station, or a board on the base for hand-held images, if that gains
+    more than further images of the present kind.
+    """
+    if forecast is None:
         return []
-    return [
-        note(
-            "images.second_place",
-            number=forecast.photographs,
-            tool_sigma=forecast.second,
-            tool_sigma_before=forecast.position,
-        )
-    ]
-
-
-def _base_board(forecast: Forecast | None) -> list[Finding]:
-    """Advice to put a board on the base where hand-held images gain by it."""
-    if forecast is None or not forecast.with_board * RELEVANT_FACTOR < forecast.position:
-        return []
-    return [
-        note(
-            "images.base_board",
-            tool_sigma=forecast.with_board,
-            tool_sigma_before=forecast.position,
-        )
-    ]
+    before, out = forecast.position, list[Finding]()
+    if (sigma := forecast.second) * RELEVANT_FACTOR < before:
+        at = {"number": forecast.photographs, "tool_sigma": sigma, "tool_sigma_before": before}
+        out.append(note("images.second_place", **at))
+    if (sigma := forecast.with_board) * RELEVANT_FACTOR < before:
+        out.append(note("images.base_board", tool_sigma=sigma, tool_sigma_before=before))
+    return out
 
 
 def _from_one_side(inspection: Inspection) -> list[Finding]:

@@ -21,15 +21,23 @@ from pkmcal.boards.board import Board, chessboard, load_board
 from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import Information
-from pkmcal.measurements import Mount
+from pkmcal.measurements import BOARD_MOUNT_NAME, Mount
+from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
-from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges, joined_pools, spread_over
+from pkmcal.planning.first import (
+    EdgesOf,
+    FirstEdges,
+    Pools,
+    first_edges,
+    joined_pools,
+    spread_over,
+)
 from pkmcal.planning.information import tool_by_free
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, all_pairs
-from pkmcal.planning.subject import BOARD_MOUNT_NAME, PLAN_IMAGES_A_STATION
+from pkmcal.planning.subject import PLAN_IMAGES_A_STATION
 
 NEAR_END = 0.15
 """Part of a joint's range, at either end, whose readings count as extreme; notes alone depend on
@@ -80,7 +88,6 @@ class Forecast:
     second : position, m, if half of the images are taken a quarter turn around the machine; NaN
         with several stations or a panoramic camera.
     edges : by station, for advice; empty for hand-held images.
-    handheld : whether the images are hand-held.
     with_board : position, m, by hand-held images with a board on the base; NaN if there is one, or
         on tripods.
     """
@@ -93,8 +100,12 @@ class Forecast:
     second: float
     legs: tuple[LegForecast, ...]
     edges: tuple[EdgesOf, ...] = ()
-    handheld: bool = False
     with_board: float = np.nan
+
+    @property
+    def handheld(self) -> bool:
+        """Whether the images are hand-held, each with a pose of its own."""
+        return not self.edges
 
 
 def forecast(inspection: Inspection, images: int = CONFIGURATIONS_A_CAPTURE) -> Forecast | None:
@@ -133,7 +144,11 @@ def forecast(inspection: Inspection, images: int = CONFIGURATIONS_A_CAPTURE) -> 
         readings=information.readings,
         drawing=information.drawing,
         second=second,
-        legs=_by_leg(inspection, first, information),
+        legs=tuple(
+            leg
+            for s, station in enumerate(stations)
+            for leg in _by_leg(station.name, [station], first, information, slice(s, s + 1))
+        ),
         edges=first.edges,
     )
 
@@ -156,21 +171,9 @@ def _by_hand(inspection: Inspection) -> Forecast | None:
         inspection.poses,
         HANDHELD_PASSES,
     )
-    pools = joined_pools(first.pools)
     T_camera_base = np.stack([station.T_camera_base for station in localized])
-    rig = Rig(
-        session.machine,
-        tuple(station.name for station in localized),
-        T_camera_base,
-        numbered(session.camera_of_station[[s.images.station for s in localized]]),
-        session.joint_noise,
-        tuple(
-            LegsFrom(k, s.images.camera, s.T_camera_base, pools, s.images.binning)
-            for k, s in enumerate(localized)
-        ),
-        shading=first.estimate.statistics.shading,
-        temperatures=session.temperature,
-    )
+    all_pools = [joined_pools(first.pools)] * len(localized)
+    rig = _rig(inspection, localized, session.machine, T_camera_base, all_pools, first)
     number = np.arange(len(localized))
     pairs = np.stack([number, [s.images.configuration[0] for s in localized]], axis=-1)
     capture = _Capture(rig, inspection.poses, session.joints, pairs)
@@ -187,8 +190,7 @@ def _by_hand(inspection: Inspection) -> Forecast | None:
         readings=information.readings,
         drawing=information.drawing,
         second=np.nan,
-        legs=_by_leg_of_all(entry, localized, first, information),
-        handheld=True,
+        legs=tuple(_by_leg(entry, localized, first, information, slice(None))),
         with_board=np.nan if has_board else with_board.position,
     )
 
@@ -211,6 +213,32 @@ class _CaptureInformation(NamedTuple):
     variance: Array
     readings: float
     drawing: float
+
+
+def _rig(
+    inspection: Inspection,
+    stations: Sequence[StationInspection],
+    machine: Machine,
+    T_camera_base: Array,
+    pools: Sequence[Pools],
+    first: FirstEdges,
+) -> Rig:
+    """Rig of cameras at T_camera_base (S, 4, 4) that observe legs; pools : by station."""
+    session = inspection.session
+    cameras = zip(stations, T_camera_base, pools, strict=True)
+    return Rig(
+        machine,
+        tuple(station.name for station in stations),
+        T_camera_base,
+        numbered(session.camera_of_station[[s.images.station for s in stations]]),
+        session.joint_noise,
+        tuple(
+            LegsFrom(k, s.images.camera, T, own, s.images.binning)
+            for k, (s, T, own) in enumerate(cameras)
+        ),
+        shading=first.estimate.statistics.shading,
+        temperatures=session.temperature,
+    )
 
 
 def _with_base_board(rig: Rig, board: Board) -> Rig:
@@ -252,20 +280,7 @@ def _planned_capture(inspection: Inspection, first: FirstEdges, images: int) -> 
     number = np.arange(images)
     pairs = [all_pairs([s], number + (0 if shared else images * s)) for s in range(len(rows))]
     T_camera_base = first.estimate.state.T_camera_base
-    cameras = zip(stations, T_camera_base, first.pools, strict=True)
-    rig = Rig(
-        machine,
-        tuple(station.name for station in stations),
-        T_camera_base,
-        numbered(inspection.session.camera_of_station[[s.images.station for s in stations]]),
-        inspection.session.joint_noise,
-        tuple(
-            LegsFrom(k, s.images.camera, T, pools, s.images.binning)
-            for k, (s, T, pools) in enumerate(cameras)
-        ),
-        shading=first.estimate.statistics.shading,
-        temperatures=inspection.session.temperature,
-    )
+    rig = _rig(inspection, stations, machine, T_camera_base, first.pools, first)
     return _Capture(rig, poses[:wanted], readings[:wanted], np.concatenate(pairs))
 
 
@@ -344,56 +359,36 @@ def _capture_information(capture: _Capture) -> _CaptureInformation:
 
 
 def _by_leg(
-    inspection: Inspection, first: FirstEdges, information: _CaptureInformation
-) -> tuple[LegForecast, ...]:
-    tubes, out = tubes_of(inspection.session.machine), list[LegForecast]()
-    for s, (station, edges) in enumerate(zip(inspection.stations, first.edges, strict=True)):
-        hidden = station.quality.hidden.mean(axis=0) if station.quality else None
-        for j in np.unique(tubes.leg):
-            mine = tubes.leg == j
-            expected = int(edges.expected[:, mine].sum())
-            inliers = int(edges.valid[:, mine].sum())
-            out.append(
-                LegForecast(
-                    station=station.name,
-                    leg=int(j) + 1,
-                    seen=float("nan") if hidden is None else float(1 - hidden[j]),
-                    found=inliers / expected if expected else float("nan"),
-                    sigma=float(first.sigma[s, j]),
-                    tells=float(information.share[s, j]),
-                    variance=float(information.variance[s, j]),
-                )
-            )
-    return tuple(out)
-
-
-def _by_leg_of_all(
     name: str,
-    localized: Sequence[StationInspection],
+    stations: Sequence[StationInspection],
     first: FirstEdges,
     information: _CaptureInformation,
-) -> tuple[LegForecast, ...]:
-    """Forecast for each leg in all hand-held images of a station's entry."""
+    of: slice,
+) -> list[LegForecast]:
+    """Forecast for each leg under a name: of one station, or of hand-held images together.
+
+    stations : those that the name stands for.
+    of : their part of the first edges and of the information.
+    """
     tubes = tubes_of(first.estimate.machine)
-    hidden = np.mean([s.quality.hidden.mean(axis=0) for s in localized if s.quality], axis=0)
-    expected, valid = (
-        np.sum([getattr(edges, field).sum(axis=0) for edges in first.edges], axis=0)
-        for field in ("expected", "valid")
-    )
+    hidden = np.mean([s.quality.hidden.mean(axis=0) for s in stations if s.quality], axis=0)
+    expected = np.sum([edges.expected.sum(axis=0) for edges in first.edges[of]], axis=0)
+    inliers = np.sum([edges.valid.sum(axis=0) for edges in first.edges[of]], axis=0)
     out: list[LegForecast] = []
     for j in np.unique(tubes.leg).tolist():
         mine = tubes.leg == j
         number = int(expected[mine].sum())
-        sigma = first.sigma[np.isfinite(first.sigma[:, j]), j]
+        sigma = first.sigma[of, j]
+        sigma = sigma[np.isfinite(sigma)]
         out.append(
             LegForecast(
                 station=name,
                 leg=j + 1,
                 seen=float(1 - hidden[j]),
-                found=float(valid[mine].sum() / number) if number else float("nan"),
+                found=float(inliers[mine].sum() / number) if number else float("nan"),
                 sigma=float(np.median(sigma)) if sigma.size else float("nan"),
-                tells=float(information.share[:, j].sum()),
-                variance=float(information.variance[:, j].sum()),
+                tells=float(information.share[of, j].sum()),
+                variance=float(information.variance[of, j].sum()),
             )
         )
-    return tuple(out)
+    return out

@@ -146,7 +146,7 @@ def write_pictures(inspection: Inspection, folder: Path) -> None:
             done, packed = cv2.imencode(".png", picture(inspection, inspection.stations[s], k))
             if not done:
                 raise OSError(f"{name} could not be encoded as PNG")
-            place_below(stage, name).write_bytes(packed.tobytes())
+            place_below(stage, name, folder).write_bytes(packed.tobytes())
 
 
 def picture(inspection: Inspection, station: StationInspection, k: int) -> Any:

@@ -119,6 +119,7 @@ class SessionCheck:
         out["advice"] = [finding.text for finding in self.advice]
         if self.forecast:
             out["forecast"].pop("edges")
+            out["forecast"]["handheld"] = self.forecast.handheld
         return first_error(self.findings) | out
 
 

@@ -27,11 +27,21 @@ MOST_IN_HELP = 1e12
 
 
 class _Option(click.Option):
-    """Option with the heading of its group in the help."""
+    """Option with the heading of its group in the help.
 
-    def __init__(self, flags: list[str], group: str, **settings: Any) -> None:
-        super().__init__(flags, **settings)
-        self.group = group
+    earlier : a former name, which is accepted and not in the help.
+    """
+
+    def __init__(self, flags: list[str], group: str, earlier: str = "", **settings: Any) -> None:
+        super().__init__([*flags, earlier] if earlier else flags, **settings)
+        self.group, self.earlier = group, earlier
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Names without the earlier one, and description."""
+        record = super().get_help_record(ctx)
+        if record is None or not self.earlier:
+            return record
+        return record[0].replace(f", {self.earlier}", ""), record[1]
 
 
 class _Argument(click.Argument):
@@ -101,7 +111,9 @@ def option(
     flags: str, metavar: str, described: str, kind: Any = str, *, group: str = "Options",
     **settings: Any,
 ) -> Any:  # fmt: skip
-    """Option with a value. flags : names, such as ``-o --out``. kind : ``str`` or ``Path``."""
+    """Option with a value. flags : names, such as ``-o --out``, and the argument's if it has
+    another. kind : ``str`` or ``Path``.
+    """
     return _Option(
         flags.split(), group, metavar=metavar, help=described, type=_type(kind), **settings
     )

@@ -12,7 +12,7 @@ from pkmcal.ranges import GOOD_ENCODER_SIGMA, Light, Style
 
 EXAMPLES = """\
 pkmcal simulate session
-pkmcal simulate session --mechanism h4 --board --size 640x480
+pkmcal simulate session --machine h4 --board --size 640x480
 pkmcal simulate session --plan plan --joint-noise "3 um" --noise 2
 """
 
@@ -24,8 +24,8 @@ IMAGES, BOARD = "Images", "Board"
     EXAMPLES,
     argument("folder", "DIR", "New or empty folder.", Path),
     option(
-        "--mechanism", "MACHINE", "Name of a built-in machine, or mechanism file."
-        " [default: gough-stewart]", default="gough-stewart",
+        "--machine mechanism", "MACHINE", "Name of a built-in machine, or mechanism file."
+        " [default: gough-stewart]", default="gough-stewart", earlier="--mechanism",
     ),
     number("simulate", "stations", "N", "Number of stations."),
     number("simulate", "configurations", "N", "Configurations for each station."),

@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -353,29 +354,26 @@ class Fit:
         return np.where(np.abs(both[0] - near) < np.abs(both[1] - near), both[0], both[1])
 
 
+@lru_cache(maxsize=1)
 def fit_of(
     source: MachineSource, program: str, linear: Freedoms, rotary: Freedoms | None = None
 ) -> Fit:
     """Parameters of a firmware for a source's machine, with the free parameters of its kind.
 
-    The text, its check, its values and its notes have the same fit, which is computed once.
+    The text, its check, its values and its notes have the same fit, so the last one is retained.
     Raises InputError for a machine that is no delta, or a rotary one without `rotary`.
     """
-
-    def fit() -> Fit:
-        delta = delta_of(source.machine, program, source.bed)
-        freedoms = linear if delta.kind == "linear" else rotary
-        if freedoms is None:
-            raise InputError(
-                f"{program} has settings for linear deltas, and mechanism"
-                f" {source.machine.name!r} is a rotary one",
-                expected="three sliders",
-                next_step="Export it with --to klipper or --to reprap",
-                code="export.no_linear_delta",
-            )
-        return nearest_fit(delta, freedoms)
-
-    return source.once(("fit", program, linear, rotary), fit)
+    delta = delta_of(source.machine, program, source.bed)
+    freedoms = linear if delta.kind == "linear" else rotary
+    if freedoms is None:
+        raise InputError(
+            f"{program} has settings for linear deltas, and mechanism"
+            f" {source.machine.name!r} is a rotary one",
+            expected="three sliders",
+            next_step="Export it with --to klipper or --to reprap",
+            code="export.no_linear_delta",
+        )
+    return nearest_fit(delta, freedoms)
 
 
 def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:

@@ -52,7 +52,7 @@ from pkmcal.files.quantities import (
 )
 from pkmcal.files.refusals import next_step_after
 from pkmcal.files.regular import check_regular, resolved
-from pkmcal.files.schema import Schema, validated_document
+from pkmcal.files.schema import FieldError, Schema, validated_document
 from pkmcal.files.tables import CsvTable, PairTable, csv_text, read_csv, read_pairs
 from pkmcal.files.writing import (
     alone_in,
@@ -83,6 +83,7 @@ __all__ = [
     "CsvTable",
     "Document",
     "Exif",
+    "FieldError",
     "Keys",
     "Metres",
     "PairTable",

@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import BeforeValidator
 
 from pkmcal.files.documents import quoted
+from pkmcal.files.schema import FieldError
 
 LARGEST_UNITLESS_LENGTH = 50.0
 """Length (m) above which a number without a unit was written in millimetres."""
@@ -88,10 +89,11 @@ def split_head(head: str) -> tuple[str, Unit | None]:
     return (match[1], column_unit) if match and column_unit else (head, None)
 
 
-def no_such(kind: str, value: object) -> str:
-    """Message for a value whose unit is of another kind."""
+def no_such(kind: str, value: object) -> FieldError:
+    """Error for a value whose unit is of another kind."""
     what, plain, example = _KINDS[kind]
-    return f"{quoted(value)} is not {what}; write it in {plain}, or with a unit, such as {example}"
+    expected = f"{plain}, or a unit, such as {example}"
+    return FieldError(f"this is not {what}", found=quoted(value), expected=expected)
 
 
 def _read(kind: str, value: Any) -> Any:
@@ -101,7 +103,7 @@ def _read(kind: str, value: Any) -> Any:
         return value
     stated_unit = unit(match[2])
     if stated_unit is None or stated_unit.kind not in kind.split(" or "):
-        raise ValueError(no_such(kind, value))
+        raise no_such(kind, value)
     # decimal arithmetic, so that 269.3 mm equals 0.2693
     return float(Decimal(match[1]) * Decimal(repr(stated_unit.factor)))
 

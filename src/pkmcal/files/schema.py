@@ -34,6 +34,19 @@ class Schema(BaseModel):
         return text if len(text) <= LONGEST_REPR else f"{text[: LONGEST_REPR - 1]}…"
 
 
+class FieldError(ValueError):
+    """Fault of a value, raised by a validator of a schema; what, found, expected : as in
+    :class:`~pkmcal.errors.PkmcalError`. The validated document has its place.
+    """
+
+    def __init__(self, what: str, *, found: object = None, expected: str | None = None) -> None:
+        super().__init__(what)
+        self.error = InputError(what, found=found, expected=expected)
+
+    def __str__(self) -> str:
+        return str(self.error)
+
+
 def validated_document(document: Document, model: type[SchemaModel]) -> SchemaModel:
     """The document as a `model`; raises one `InputError` about all of its faults.
 
@@ -147,9 +160,12 @@ def _phrases(
             str(context["tag"]) if "tag" in context else None,
             f"one of {tags}".replace("'", ""),
         )
-    if kind in ("value_error", "assertion_error"):
-        # A schema's own validator wrote a whole sentence.
-        return str(context["error"]), None, None
+    if kind == "value_error":
+        # by a schema's own validator
+        error = context["error"]
+        if isinstance(error, FieldError):
+            return error.error.what, error.error.found, error.error.expected
+        return str(error), quoted(value), None
     if kind == "too_long" and isinstance(value, (list, dict)):
         entries = f"{len(value)} entries"
         return _WHAT[kind], entries, _EXPECTED[kind].format_map(context)

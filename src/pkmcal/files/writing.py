@@ -131,21 +131,21 @@ def write_folder(
     with staged_folder(folder, over) as stage:
         for name, text in texts.items():
             content = text.encode("utf-8") if isinstance(text, str) else text
-            path = place_below(stage, name)
+            path = place_below(stage, name, folder)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
 
 
-def place_below(folder: Path, name: str) -> Path:
-    """Path of a file in a folder, by a name that may contain words of a session.
+def place_below(stage: Path, name: str, folder: Path) -> Path:
+    """Path of a file in a folder's stage, by a name that may contain words of a session.
 
-    Raises `InputError` where it would be outside the folder.
+    Raises `InputError` at ``folder`` where it would be outside.
     """
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts or not PurePath(name).name:
         raise InputError(
             "no file can have this name", where=str(folder), found=name, code="file.impossible_name"
         )
-    return folder / name
+    return stage / name
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -6,6 +6,7 @@ from pkmcal.measurements.line_cells import SHADING_CORRELATION_ANGLE, TUBE_CORRE
 from pkmcal.measurements.links import LinkRows, LinkSet
 from pkmcal.measurements.poses import PoseSet
 from pkmcal.measurements.sets import (
+    BOARD_MOUNT_NAME,
     Measurements,
     Mount,
     Observation,
@@ -15,6 +16,7 @@ from pkmcal.measurements.sets import (
 )
 
 __all__ = [
+    "BOARD_MOUNT_NAME",
     "OWN_SHADING",
     "SHADING_CORRELATION_ANGLE",
     "SHADING_SIGMA",

@@ -71,6 +71,10 @@ def of_stations(edges: Mapping[int, EdgeSet]) -> EdgeSet:
     return concatenate([replace(e, station=np.full(len(e), k)) for k, e in edges.items()])
 
 
+BOARD_MOUNT_NAME = "board"
+"""Name of the mount of a session's board."""
+
+
 @dataclass(frozen=True)
 class Mount:
     """Body to which a board or a tracker's target is fixed; its pose on the body is estimated.

@@ -19,7 +19,16 @@ from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME
-from pkmcal.files import MOST_LEG_TUBES, MOST_MACHINE_LEGS, Metres, Point, Radians, Schema, Share
+from pkmcal.files import (
+    MOST_LEG_TUBES,
+    MOST_MACHINE_LEGS,
+    FieldError,
+    Metres,
+    Point,
+    Radians,
+    Schema,
+    Share,
+)
 from pkmcal.mechanisms.carriers.contract import (
     Carrier,
     ParameterKind,
@@ -32,7 +41,11 @@ from pkmcal.mechanisms.parameters import EVERY_LEG
 def _check_increasing(value: tuple[float, float]) -> tuple[float, float]:
     """Validate a range of lengths."""
     if not 0 < value[0] < value[1]:
-        raise ValueError("should be two increasing positive lengths [min, max]")
+        raise FieldError(
+            "the range is not increasing",
+            found=list(value),
+            expected="two increasing positive lengths [min, max]",
+        )
     return value
 
 
@@ -114,8 +127,10 @@ among the six."""
 def _check_turn(angle: float) -> float:
     """Validate an angle: a number beyond a turn was written in degrees."""
     if abs(angle) > 2 * np.pi:
-        raise ValueError(
-            "should be at most a turn, such as 15 deg; without a unit it is in radians"
+        raise FieldError(
+            "this angle is more than a turn; without a unit it is in radians",
+            found=f"{angle:g}",
+            expected="at most a turn, such as 15 deg",
         )
     return angle
 
@@ -205,7 +220,11 @@ class Tube(Schema):
     def model_post_init(self, _context: Any) -> None:
         """Refuse tubes without positive length."""
         if self.stop <= self.start:
-            raise ValueError("tube's 'to' should be greater than its 'from'")
+            raise FieldError(
+                "a tube has no length",
+                found=f"from {self.start:g} to {self.stop:g}",
+                expected="'to' greater than 'from'",
+            )
 
 
 class Leg(Schema):
@@ -304,10 +323,16 @@ class Home(Schema):
 def _check_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     """Validate the number of legs and that one is actuated."""
     if len(legs) < 2:
-        raise ValueError("a parallel machine has at least two legs")
+        raise FieldError(
+            "too few legs of a parallel machine", found=len(legs), expected="two or more"
+        )
     carriers = base_carriers()
     if not any(isinstance(x.length, ActuatedLength) or carriers[x.base.joint].driven for x in legs):
-        raise ValueError("a machine has at least one leg with actuated: true")
+        raise FieldError(
+            "no reading moves the machine",
+            found=f"none of {len(legs)} legs",
+            expected="a leg with actuated: true",
+        )
     return legs
 
 
@@ -332,7 +357,11 @@ class DocumentModel(Schema):
     def model_post_init(self, _context: Any) -> None:
         """Refuse roles beside another file, which has its own."""
         if self.mechanism is not None and (self.fixed or self.tied):
-            raise ValueError("a model with 'mechanism' takes 'fixed' and 'tied' from that file")
+            raise FieldError(
+                "a model with 'mechanism' takes 'fixed' and 'tied' from that file",
+                found="fixed" if self.fixed else "tied",
+                expected="'mechanism' alone",
+            )
 
 
 class MechanismDocument(Schema):

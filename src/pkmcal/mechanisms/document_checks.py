@@ -280,13 +280,14 @@ def check_held(document: MechanismDocument, place: PlaceInDocument) -> None:
     why = ""
     if passive:
         one = len(passive) == 1
-        why = f"; {'leg' if one else 'legs'} {listed([str(j) for j in passive])}, passive, "
-        why += "holds nothing" if one else "hold nothing"
+        why = f"; passive {'leg' if one else 'legs'} {listed([str(j) for j in passive])} hold"
+        why += "s nothing" if one else " nothing"
     joints = dict.fromkeys(leg.platform.joint for leg in document.legs)
     kinds = [f"{x.replace('-', ' ')}s" for x in joints if platform_carriers()[x].turns]
     raise InputError(
-        f"the legs do not hold the platform: {count} equations for {freedoms} freedoms{why}",
+        "the legs do not hold the platform",
         where=place("legs"),
+        found=f"{count} equations for {freedoms} freedoms{why}",
         expected="one equation a leg with a length, one a revolute joint, one a pair of universal "
         f"joints with axes; {freedoms} for motion: {document.motion}"
         f"{f' and its {listed(kinds)}' if kinds else ''}",

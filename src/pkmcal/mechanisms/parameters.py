@@ -61,7 +61,8 @@ class ParameterTable:
         except ValueError:
             close = get_close_matches(name, self.names, n=1)
             raise InputError(
-                what=f"there is no parameter {name!r}",
+                what="there is no such parameter",
+                found=repr(name),
                 expected=f"a name such as {close[0] if close else self.names[0]!r}",
                 next_step="write the parameter as its path in the mechanism file, legs from 1",
             ) from None

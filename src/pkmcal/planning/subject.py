@@ -30,7 +30,7 @@ from pkmcal.files import Unit
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.start import start_mounts
 from pkmcal.levels import NEGLIGIBLE
-from pkmcal.measurements import SHADING_SIGMA, Mount
+from pkmcal.measurements import BOARD_MOUNT_NAME, SHADING_SIGMA, Mount
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import first_binning
 from pkmcal.observe.predict import tubes_of
@@ -59,7 +59,6 @@ PLAN_IMAGES_A_STATION = 12
 """Maximum number of a station's images whose edges are measured; twice as many of all stations
 together. A plan is made once, and few edges determine the shading badly.
 """
-BOARD_MOUNT_NAME = "board"
 FINEST_STEP = 1e-6
 """m or rad, step of a reading below which no drive moves."""
 

@@ -403,10 +403,8 @@ def _readings(
     table, temperature = without_temperature(whole)
     written = written_unit(document.data["joints"]["noise"])
     if written and written.kind not in machine.joint_units:
-        raise InputError(
-            no_such(machine.joint_units[0], document.data["joints"]["noise"]),
-            where=document.where("joints", "noise"),
-        )
+        error = no_such(machine.joint_units[0], document.data["joints"]["noise"]).error
+        raise error.located(document.where("joints", "noise"))
     findings = check_readings(table, machine.joint_ranges, noise, machine.joint_units, fewest)
     if measured and not schema.stations and not schema.links():
         _check_redundant(document, machine)

@@ -8,13 +8,24 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, create_model
 
 from pkmcal.cameras.response import Response
-from pkmcal.files import MOST_STATIONS, Metres, Point, Radians, Reading, Schema, closest, quoted
+from pkmcal.files import (
+    MOST_STATIONS,
+    FieldError,
+    Metres,
+    Point,
+    Radians,
+    Reading,
+    Schema,
+    closest,
+    quoted,
+)
 from pkmcal.measurements.contract import NOISE_FIELD_RANGE, LinkKind, kinds_of
 
 BoardBody = Literal["base", "platform"]
 """Bodies to which a board can be fixed."""
 Vector = tuple[float, float, float]
 OBSERVE_WORDS = ("legs", "board")
+OBSERVE_EXPECTED = "legs, board, or [legs, board]"
 """Objects that a station can observe, in the order of output."""
 
 
@@ -39,16 +50,19 @@ def _observe_words(value: Any) -> tuple[str, ...]:
     """Normalise ``observe``: one word or a list, as a tuple in the order of OBSERVE_WORDS."""
     words: list[Any] = value if isinstance(value, list) else [value]
     if not words:
-        raise ValueError("the list is empty; a station observes legs, board, or [legs, board]")
+        raise FieldError("the list is empty", found="[]", expected=OBSERVE_EXPECTED)
     for word in words:
         if word not in OBSERVE_WORDS:
             guess = closest(word, OBSERVE_WORDS) if isinstance(word, str) else None
-            wanted = guess or "legs, board, or [legs, board]"
-            raise ValueError(
-                f"no station can observe this; found {quoted(word)}, expected {wanted}"
+            raise FieldError(
+                "no station can observe this",
+                found=quoted(word),
+                expected=guess or OBSERVE_EXPECTED,
             )
     if len(set(words)) < len(words):
-        raise ValueError(f"the same word stands twice; found {quoted(words)}")
+        raise FieldError(
+            "the same word stands twice", found=quoted(words), expected=OBSERVE_EXPECTED
+        )
     return tuple(word for word in OBSERVE_WORDS if word in words)
 
 

@@ -18,7 +18,14 @@ from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot
-from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate
+from pkmcal.measurements import (
+    BOARD_MOUNT_NAME,
+    EdgeSet,
+    Measurements,
+    Mount,
+    PoseSet,
+    concatenate,
+)
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
 from pkmcal.placement.configurations import draw_configurations
@@ -132,7 +139,7 @@ class Capture:
             len(self.cameras),
             np.array([kinds[id(camera)] for camera in self.cameras]),
             poses=PoseSet(self.views[:, 0], self.views[:, 1], none, unit, white),
-            mounts=(Mount("board", "platform"),) if n else (),
+            mounts=(Mount(BOARD_MOUNT_NAME, "platform"),) if n else (),
             shaded=len(self.edges) > 0,
         )
 

@@ -17,7 +17,7 @@ from pkmcal.identify.assembly import assemble
 from pkmcal.identify.axis_measurements import as_edges, to_coordinates
 from pkmcal.identify.gauge import Gauge
 from pkmcal.identify.problem import Problem
-from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
+from pkmcal.measurements import BOARD_MOUNT_NAME, EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 
@@ -132,7 +132,7 @@ def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
         whiten = np.broadcast_to(np.diag(1 / data.noise.pose), (n, 6, 6))
         measured = data.T_camera_board[run, :n]
         poses = PoseSet(view.station[:n], np.arange(n), none, measured, whiten)
-        mounts = (Mount("board", "platform"),)
+        mounts = (Mount(BOARD_MOUNT_NAME, "platform"),)
     stations = len(view.T_camera_base)
     return Measurements(
         _positions_of_axes(view),

@@ -25,7 +25,7 @@ from pydantic import AfterValidator
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Metres, Radians, Schema
+from pkmcal.files import FieldError, Metres, Radians, Schema
 from pkmcal.geometry.rigid import apply, dot, skew
 
 SHORTEST_AXIS_LENGTH = 1e-6
@@ -53,7 +53,11 @@ def _direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
     """Validate and normalise a direction."""
     length = hypot(*axis)
     if length < SHORTEST_AXIS_LENGTH:
-        raise ValueError("an axis of length zero is no direction; write one such as [0, 0, 1]")
+        raise FieldError(
+            "an axis of length zero is no direction",
+            found=list(axis),
+            expected="one such as [0, 0, 1]",
+        )
     if abs(length - 1) < 1e-12:  # keep written unit axes to the last digit
         return axis
     x, y, z = (c / length for c in axis)
@@ -66,7 +70,11 @@ Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
 def _rising(value: tuple[float, float]) -> tuple[float, float]:
     """Validate a range of readings."""
     if not value[0] < value[1]:
-        raise ValueError("should be two increasing readings [min, max]")
+        raise FieldError(
+            "the range is not increasing",
+            found=list(value),
+            expected="two increasing readings [min, max]",
+        )
     return value
 
 
