@@ -34,9 +34,6 @@ from pkmcal.wording import listed
 LOOPS_ENDING = ".loops.yaml"
 FORMATS = {"mujoco": "MJCF", "sdf": "SDF", "robot": "URDF"}
 """Formats by the root of their XML."""
-SAME_POSE_SHARE = 1e-4
-"""Largest difference of platform poses between file and nominal model: a share of the size, and
-rad."""
 EQUAL_SHARE = 1e-9
 """Difference above which the nominal model's comment states it."""
 COMPARED_POSES = 8
@@ -378,10 +375,10 @@ def _difference(model: ReadModel, parts: RigidBodies, platform: int, machine: Ma
     away = pose_difference(model.places(x)[PLATFORM_NAME], poses) / ([1.0] * 3 + [parts.size] * 3)
     gaps = np.abs(model.gaps(x)) / min(1.0, parts.size)
     worst = float(max(np.abs(away).max(), gaps.max(initial=0.0)))
-    if not worst < SAME_POSE_SHARE:  # NaN, too
+    if not worst < GEOMETRY_SHARE:  # NaN, too
         raise InputError(
             "the legs between base and platform do not move it as the file's bodies do",
             found=f"a difference of {worst:.3g} of the machine's size",
-            expected=f"less than {SAME_POSE_SHARE:g}",
+            expected=f"less than {GEOMETRY_SHARE:g}",
         )
     return worst

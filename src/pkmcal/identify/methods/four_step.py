@@ -67,13 +67,11 @@ from pkmcal.identify.methods.registration import (
 )
 from pkmcal.identify.nominal_joints import NominalJoints, base_gauge, nominal_joints, platform_gauge
 from pkmcal.identify.state import State
+from pkmcal.levels import MAJORITY
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 FourStepForm = Literal["corrected", "printed"]
-VAGUE_CENTRE_SHARE = 0.1
-"""Standard deviation of a base centre, relative to the base's size, above which it is rejected. Not
-checked within a factor of two."""
 
 
 @dataclass(frozen=True)
@@ -331,13 +329,13 @@ def four_step(
 
 
 def _determined_mask(value: linear.LinearCentres, machine: Machine) -> Booleans:
-    """(S, L) base centres whose standard deviation is below VAGUE_CENTRE_SHARE of the
-    base's size.
+    """(S, L) base centres whose standard deviation is below half of the base's size, as of
+    lengths (:func:`four_step_checks.lengths_are_fixed`).
     """
     size = extent(machine.base_centers())
     finite = np.all(np.isfinite(value.centres), axis=-1)
     covariance = np.where(finite[..., None, None], value.covariance, np.eye(3))
-    return finite & (np.linalg.eigvalsh(covariance)[..., -1] < (VAGUE_CENTRE_SHARE * size) ** 2)
+    return finite & (np.linalg.eigvalsh(covariance)[..., -1] < (MAJORITY * size) ** 2)
 
 
 def _views(
