@@ -50,7 +50,8 @@ LARGEST_NOMINAL_ERROR = UNEXPLAINED_SCALE * OUTLIER_SIGMAS
 or the readings are wrong: 12. As of any standard deviation, the errors may be UNEXPLAINED_SCALE
 times as large as a file states, and beyond OUTLIER_SIGMAS of those there is an outlier."""
 FEWEST_EDGES = 24
-"""Minimum number of edges of an estimate; a single image of a hexapod has as many."""
+"""Minimum number of edges of an estimate: with two numbers each, as many as the 48 unknowns of a
+hexapod, two joint centres and an offset for each leg, and of its camera's pose."""
 RELEVANT_FACTOR = 1.2
 """Factor on a standard deviation that matters: that of half as many images in addition."""
 RELEVANT_SHARE = (1 - RELEVANT_FACTOR**-2) ** 0.5

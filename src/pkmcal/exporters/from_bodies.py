@@ -46,8 +46,8 @@ GEARED = (
     " the drives' positions are not in them."
 )
 LEAST_SCALE, MOST_SCALE = 0.5, 2.0
-"""Bounds of the ratio of a joint's value and its reading; beyond them it is a gear of something
-else."""
+"""Bounds of the ratio of a joint's value and its reading: those of ``scale`` in a mechanism file.
+Other ratios are gears between joint and drive."""
 PLATFORM_NAME, BASE_NAME = "platform", "base"
 MOTIONS = {
     ("xyz", 3): "spatial",

@@ -35,7 +35,7 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.row_sums import GroupRows, group_rows
-from pkmcal.levels import FALSE_ALARM, NEGLIGIBLE, UNEXPLAINED_SCALE
+from pkmcal.levels import NEGLIGIBLE, UNEXPLAINED_SCALE
 from pkmcal.measurements.rows import RowGroups
 
 LEAST_NOISE_FREEDOM = 4.0
@@ -48,9 +48,9 @@ more than four degrees of freedom only."""
 class NoiseOptions:
     """Constants of the restricted likelihood of a noise."""
 
-    # probability of contradicting a noise that is stated correctly, shared by the three kinds of
-    # rows
-    contradiction_chance: float = FALSE_ALARM / 3
+    # probability of contradicting a noise that is stated correctly: a negligible one, as of cells
+    # of the report's residuals, shared by the three kinds of rows
+    contradiction_chance: float = NEGLIGIBLE / 3
     # largest factor on a noise in one step, beyond which the linear model no longer holds
     largest_step: float = 10.0
     # largest number of rows whose residuals are decorrelated together. More rows are handled in

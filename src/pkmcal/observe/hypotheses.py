@@ -98,9 +98,10 @@ class ImageEvidenceOptions:
 
     # log-likelihood ratio (nats) of a rough pose against readings that place the camera on another
     # side of the machine: more than that of any images, because a person does not mistake the
-    # side, and a machine of equal parts looks the same from each. The refusal names the pose as a
-    # rival
-    pose_by_hand: float = 1000.0
+    # side, and a machine of equal parts looks the same from each. Ten thousand images of a hundred
+    # edges, each with two measurements of less than five nats, have 1e7. The refusal names the pose
+    # as a rival
+    pose_by_hand: float = 1e9
     # margin, as a share of the mean log-likelihood ratio of a station's images, by which a mistake
     # has to be likelier: another name of an image, another numbering of the legs, or any mistake
     # where the machine was not localized as stated. Between nearly equal configurations, equal
