@@ -261,7 +261,7 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
 
 
 def test_a_result_that_is_no_gain_is_refused(whole):
-    """Legs are judged as heights are: half of what the prior sigmas let expect is too much."""
+    """Legs are judged as heights are: by a share of what the prior sigmas let expect."""
     observation, estimate, findings, _ = whole
     sigma = platform_sigma(estimate)
     for share, usable in ((0.9, True), (1.1, False)):
@@ -272,6 +272,14 @@ def test_a_result_that_is_no_gain_is_refused(whole):
         assert len(value.reasons) == (not usable)
     assert no_gain(np.nan, 1.0)
     assert not no_gain(0.0, 0.0)
+
+
+def test_a_result_at_the_limit_is_worse_than_the_nominal_model_in_one_of_twenty_cases():
+    """The squared errors of a pose's six numbers, drawn for both."""
+    rng = np.random.default_rng(0)
+    nominal, result = (np.sum(rng.normal(size=(100_000, 6)) ** 2, axis=1) for _ in range(2))
+    worse = VERDICT.nominal_error_share**2 * result > nominal
+    assert np.mean(worse) == pytest.approx(0.05, abs=0.003)
 
 
 def test_without_a_degree_of_freedom_it_is_refused(whole):

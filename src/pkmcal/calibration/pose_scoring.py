@@ -48,6 +48,7 @@ from pkmcal.observe.pose_likelihood import (
     refine_ml,
 )
 from pkmcal.observe.silhouettes import silhouette_edges
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS
 from pkmcal.session.load import Session
 
 
@@ -56,9 +57,9 @@ class PoseScoringOptions:
     """Constants of the scores of an image's candidate poses with a known machine."""
 
     # largest number of candidate poses that are scored, and their largest difference from the best
-    # log-likelihood ratio, in measurements: the odds are then one in a hundred thousand
+    # log-likelihood ratio, in measurements
     candidates: int = 8
-    most_behind_best: float = 12.0
+    most_behind_best: float = HYPOTHESIS_THRESHOLDS.beam
     # number of poses that are refined locally, once other images have determined the machine
     refined_locally: int = 4
     # ratio by which the number of images that determine the machine must grow before likelier poses

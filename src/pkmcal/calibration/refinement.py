@@ -33,7 +33,7 @@ from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import edge_misfit, start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.verdict import POLISHED_SHADING
-from pkmcal.levels import FEW, FEWEST_EDGES, NEARLY_ALL
+from pkmcal.levels import FEW, FEWEST_EDGES, NEARLY_ALL, NOISE_EXCESS
 from pkmcal.measurements import (
     EdgeSet,
     Measurements,
@@ -71,15 +71,16 @@ class RefinementOptions:
     # upper bound of the measurement passes
     most_passes: int = 9
     # largest change of a converged machine by a measurement pass, root mean square over the
-    # determined directions, in standard deviations. The second pass usually causes a half to one,
-    # and each pass over polished legs one, because it measures other edges. With a camera that
-    # starts centimetres off and converges slowly, predicted and measured edges agree, but each pass
-    # changes the machine by four or more
-    settled_change: float = 2.0
-    # the same for ending after the second pass: if that changes the machine by more, a further pass
-    # reduces the remaining dependence on the starting point to a quarter. With half of it most
-    # machines would need a third pass; not checked with twice
-    early_settled_change: float = 1.0
+    # determined directions, in standard deviations. Two passes with independent errors, as over
+    # polished legs, of which each measures other edges, differ by the root of two, which may be
+    # NOISE_EXCESS times as large as any errors: 2.1. With a camera that starts centimetres off and
+    # converges slowly, predicted and measured edges agree, but each pass changes the machine by
+    # four or more
+    settled_change: float = 2**0.5 * NOISE_EXCESS
+    # the same for ending after the second pass. Each further pass reduces the dependence on the
+    # starting point to a quarter (measured), so that a third of the last change remains; with one
+    # third of a standard deviation the errors remain nearly all noise, by their squares
+    early_settled_change: float = 3 * (1 / NEARLY_ALL - 1) ** 0.5
     # median distance (px) of edges from their prediction below which a further pass changes
     # nothing: the first pass corrects a pixel, the second the remaining effect of shading, and
     # profiles reach ten times as far

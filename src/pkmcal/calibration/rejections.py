@@ -14,6 +14,7 @@ from pkmcal.identify.confirmation import RejectedUnit, rejected_units, rejection
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import platform_by_parameters, platform_sigma
 from pkmcal.identify.unidentified import Identification
+from pkmcal.levels import NEARLY_ALL
 from pkmcal.measurements import LinkSet, Measurements
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome.finding import Finding, doubtful, wrong
@@ -21,10 +22,10 @@ from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session
 from pkmcal.wording import count, listed
 
-LEAST_CHECKED_SHARE = 0.1
+LEAST_CHECKED_SHARE = 1 - NEARLY_ALL
 """Smallest mean redundancy of the links (degrees of freedom per equation), below which there is a
-warning: an outlier of up to ``4.13 / sqrt(0.1)``, thirteen, standard deviations is not detected
-(Baarda 1968). With half the limit it is eighteen, with twice nine."""
+warning: the unknowns then absorb nearly all of an outlier's square, and one of up to ``4.13 /
+sqrt(0.1)``, thirteen, standard deviations is not detected (Baarda 1968)."""
 
 
 def rejection_findings(

@@ -38,11 +38,12 @@ class ToolMapOptions:
     margin: float = 0.08
     # fewest rows and columns of cells, and smallest share of reachable cells among these, for a
     # slice: a platform that can only shift as it rotates has one orientation in few places. They
-    # decide what is drawn, not the figures; not checked within a factor of two
+    # decide what is drawn, not the figures. A triangle fills half of its rows and columns, a little
+    # less where cells are cut
     least_cells: int = 3
     least_filled: float = 0.4
-    # largest distance, in cells, by which rods and axes may put a pose off its cell's middle: half
-    # a cell would mix up neighbours
+    # largest distance, in cells, by which rods and axes may put a pose off its cell's middle: two
+    # neighbours are then drawn for poses at least half a cell apart
     most_off_middle: float = 0.25
 
 

@@ -53,7 +53,6 @@ from pkmcal.levels import (
     INSEPARABLE_CORRELATION,
     MAJORITY,
     NEGLIGIBLE,
-    OUTLIER_SIGMAS,
     UNEXPLAINED_SCALE,
 )
 from pkmcal.outcome.finding import Finding, doubtful
@@ -84,8 +83,9 @@ class CalibrationCheckOptions:
     # corners, which does not represent the rest if its errors are of another kind. Not checked
     # within a factor of two
     most_lost: float = 0.25
-    # ratio of a view's held-out error to the median of all views above which the view is reported
-    outlying_view: float = OUTLIER_SIGMAS
+    # ratio of a view's held-out error to the median of all views above which the model does not
+    # explain the view
+    outlying_view: float = UNEXPLAINED_SCALE
     # tilt of a board in degrees below which views all have the same information on the focal
     # length, which is little: in the same simulation of 6 images, a standard deviation of 1 % up to
     # 7.5 degrees, 0.3 % up to 15 and 0.1 % up to 30

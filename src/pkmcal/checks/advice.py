@@ -14,7 +14,7 @@ import numpy as np
 from pkmcal.checks.forecast import Forecast, LegForecast
 from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse
-from pkmcal.levels import MAJORITY, RELEVANT_FACTOR, RELEVANT_SHARE
+from pkmcal.levels import CAUSE_SHARE, MAJORITY, RELEVANT_FACTOR
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import PROFILE_OPTIONS
 from pkmcal.outcome import Figure, Level, Part, Row, Table
@@ -23,7 +23,7 @@ from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.first import EdgesOf
 from pkmcal.wording import brief, count, listed, named
 
-INFORMATION_LOST_SHARE = RELEVANT_SHARE**2
+INFORMATION_LOST_SHARE = CAUSE_SHARE
 """Share of the information that is lost with that factor."""
 LEG_COLUMNS = {
     "In view": "Share of the leg's edges that nothing hides.",

@@ -21,6 +21,7 @@ from pkmcal.boards.board import Board, chessboard, load_board
 from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import Information
+from pkmcal.levels import NEARLY_ALL
 from pkmcal.measurements import BOARD_MOUNT_NAME, Mount
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
@@ -39,9 +40,9 @@ from pkmcal.planning.information import tool_by_free
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, all_pairs
 from pkmcal.planning.subject import PLAN_IMAGES_A_STATION
 
-NEAR_END = 0.15
-"""Part of a joint's range, at either end, whose readings count as extreme; notes alone depend on
-it. Not checked within a factor of two."""
+NEAR_END = 1 - NEARLY_ALL
+"""Part of a joint's range, at either end, whose readings count as extreme: beyond nearly all of the
+range."""
 SECOND_STATION_TURN = np.pi / 2
 """Angle around the machine of a second station, rad: the direction that one camera determines
 worst, along its line of sight, the other determines best.

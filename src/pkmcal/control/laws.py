@@ -28,13 +28,14 @@ from pkmcal.arrays import Array
 from pkmcal.control.machine_view import Legs, MachineView, directions_of, legs_from_image, moved_to
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, cross, dot, skew
+from pkmcal.levels import ROUNDING
 
 MatrixPlace = Literal["measured", "goal", "mean"]
 
-UNCOMMANDED_MOTION_SHARE = 1e-4
+UNCOMMANDED_MOTION_SHARE = ROUNDING**0.5
 """Singular value of the scaled interaction matrix, relative to the largest, below which a motion is
-unobservable and is not commanded. Edges of all legs of a hexapod have 0.02 to 0.2, of three legs
-0.001, so that half or twice the value changes neither."""
+unobservable and is not commanded: its square, an eigenvalue of the normal equations, is rounding.
+Edges of all legs of a hexapod have 0.02 to 0.2, of three legs 0.001."""
 
 
 class Rates(NamedTuple):

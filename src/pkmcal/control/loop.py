@@ -60,9 +60,10 @@ __all__ = ["GoalImage", "Status", "Step", "VisualServo"]
 UNEXPLAINED_READINGS_LAG = OUTLIER_SIGMAS * READINGS_LAG_SIGMA
 """Difference, in metres, between an image and its readings that a control loop's delay does not
 explain."""
-VAGUE_DISTANCE_TOLERANCES = 4.0
+VAGUE_DISTANCE_TOLERANCES = 1.48
 """Standard deviation of a reading's distance to the goal, in tolerances, above which there is a
-warning; the loop goes on. Not checked within a factor of two."""
+warning; the loop goes on. A normal error is within 1 / 1.48 of its standard deviations in half of
+all cases, so that a vaguer image of the goal is not found at the goal in most cases."""
 UNSEEN_READING_SIGMA = 0.05
 """Standard deviation of a reading, in m or rad, above which an image does not determine it, and the
 loop stops. Not checked within a factor of two."""

@@ -14,13 +14,6 @@ from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, wrong
 from pkmcal.wording import named
 
-UNMENTIONED_HIDDEN_SHARE = 0.05
-"""Share of the poses with a leg behind another leg above which there is a warning. Not checked
-within a factor of two."""
-UNMENTIONED_OVERSHOOT = 0.05
-"""Overshoot, relative to the path's length, above which there is a warning, if it is also twice
-that with the identified geometry. Not checked within a factor of two."""
-
 
 def judgement(study: Study) -> Verdict:
     """Verdict on a study: headline and findings."""
@@ -82,7 +75,7 @@ def _hidden(study: Study) -> tuple[Finding, ...]:
     legs = [
         f"leg {j + 1} ({100 * part:.0f} %)"
         for j, part in zip(study.eye.true.legs, study.hidden, strict=True)
-        if part > UNMENTIONED_HIDDEN_SHARE
+        if part > 1 - NEARLY_ALL
     ]
     if not legs:
         return ()
@@ -106,7 +99,7 @@ def _by_hand(study: Study) -> Iterator[Finding]:
         yield doubtful("servo.by_hand_astray", median=off, most=most, identified=own)
     over = float(hand.overshoot[good].max(initial=0.0))
     if over > max(
-        UNMENTIONED_OVERSHOOT, 2 * float(study.trials("identified").overshoot.max(initial=0.0))
+        ARRIVED_DISTANCE_SHARE, 2 * float(study.trials("identified").overshoot.max(initial=0.0))
     ):
         yield doubtful("servo.by_hand_overshoots", share=over)
 

@@ -34,6 +34,7 @@ from pkmcal.exporters.limbs import (
 )
 from pkmcal.geometry.rigid import apply, dot, pose, rotation
 from pkmcal.identify.tool import pose_by_parameters
+from pkmcal.levels import MAJORITY
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import Finding, doubtful, note
 
@@ -50,8 +51,9 @@ FASTEST_MOTOR_RATIO = 4.0
 Beyond it a rod is nearly perpendicular to the motion of its motor, and firmwares divide by the
 cosine.
 """
-LEAST_UPRIGHT_PART = 0.8
-"""Least vertical component of a tower, or radial component of an arm's plane: within 37 degrees."""
+LEAST_UPRIGHT_PART = MAJORITY**0.5
+"""Least vertical component of a tower, or radial component of an arm's plane: within 45 degrees,
+more upright than level."""
 MM_A_METRE = 1e3
 DEGREES_A_RADIAN = 180 / np.pi
 UNWARNED_TOOL_ERROR = MM_A_METRE * UNWARNED_ERROR

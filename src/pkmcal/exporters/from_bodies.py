@@ -34,9 +34,6 @@ from pkmcal.wording import listed
 LOOPS_ENDING = ".loops.yaml"
 FORMATS = {"mujoco": "MJCF", "sdf": "SDF", "robot": "URDF"}
 """Formats by the root of their XML."""
-SAME_POSE_SHARE = 1e-4
-"""Largest difference of platform poses between file and nominal model: a share of the size, and
-rad."""
 EQUAL_SHARE = 1e-9
 """Difference above which the nominal model's comment states it."""
 COMPARED_POSES = 8
@@ -49,8 +46,8 @@ GEARED = (
     " the drives' positions are not in them."
 )
 LEAST_SCALE, MOST_SCALE = 0.5, 2.0
-"""Bounds of the ratio of a joint's value and its reading; beyond them it is a gear of something
-else."""
+"""Bounds of the ratio of a joint's value and its reading: those of ``scale`` in a mechanism file.
+Other ratios are gears between joint and drive."""
 PLATFORM_NAME, BASE_NAME = "platform", "base"
 MOTIONS = {
     ("xyz", 3): "spatial",
@@ -378,10 +375,10 @@ def _difference(model: ReadModel, parts: RigidBodies, platform: int, machine: Ma
     away = pose_difference(model.places(x)[PLATFORM_NAME], poses) / ([1.0] * 3 + [parts.size] * 3)
     gaps = np.abs(model.gaps(x)) / min(1.0, parts.size)
     worst = float(max(np.abs(away).max(), gaps.max(initial=0.0)))
-    if not worst < SAME_POSE_SHARE:  # NaN, too
+    if not worst < GEOMETRY_SHARE:  # NaN, too
         raise InputError(
             "the legs between base and platform do not move it as the file's bodies do",
             found=f"a difference of {worst:.3g} of the machine's size",
-            expected=f"less than {SAME_POSE_SHARE:g}",
+            expected=f"less than {GEOMETRY_SHARE:g}",
         )
     return worst

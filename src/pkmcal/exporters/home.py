@@ -21,7 +21,9 @@ SAME_HINGE_DIFFERENCE = 1e-9
 LEAST_SINE_TO_LEG = 0.5
 """Least sine of the angle between a leg and the first axis of its universal joint.
 
-Below it another axis is taken: at zero both hinges of the joint would be parallel in effect.
+Below it another axis is taken: at zero both hinges of the joint would be parallel in effect. Any
+value moves the platform alike, for both axes of the joint lead through the leg's end and only the
+leg's rotation about itself differs; where that matters, the axis is the file's.
 """
 BASE_FRAME_UP = np.array([0.0, 0.0, 1.0])
 

@@ -17,8 +17,8 @@ from pkmcal.levels import ROUNDING
 from pkmcal.starter.nominal import NominalLeg, millimetres
 
 GEOMETRY_SHARE = 1e-4
-"""Tolerance for axes that meet in a point, as a share of the machine's size, and of a direction:
-numbers of other files have few digits."""
+"""Tolerance for axes that meet in a point and for poses, as a share of the machine's size, and of a
+direction, rad: two numbers that files round to four decimals differ by 1e-4 at most."""
 
 
 class Chain(NamedTuple):

@@ -21,7 +21,8 @@ LARGEST_MODEL_FILE = 2**22
 LARGEST_NUMBER = 1e30
 """Largest number of a model but limits, in any unit; squares of larger ones overflow."""
 LARGEST_LIMIT = 1e3
-"""Joint limit, m or rad, above which it stands for none."""
+"""Joint limit, m or rad, above which it stands for none: no machine slides by a kilometre or turns
+a joint by 160 revolutions, and formats write 1e16 or the largest double."""
 
 
 def xml_root(text: str) -> Element:

@@ -56,7 +56,8 @@ LARGEST_PRINTER_VALUE = 1e6
 TOWER_ANGLES = (210.0, 330.0, 90.0)
 """Usual directions of the towers X, Y and Z, degrees, counted anticlockwise."""
 LEAST_LIKENESS = 0.8
-"""Likeness, by difflib, of a misspelt key: two letters exchanged in five, or one wrong in five."""
+"""Likeness, by difflib, of a misspelt key: twice the equal letters over all letters of both keys,
+with one wrong letter of five. A similar key is named in a message and never read."""
 LEAST_PRIOR_SIGMA = 1e-4
 """Prior sigma, mm, degrees or steps, below which a value is fixed: that of the written digits."""
 NUMBER = r"(-?\d+(?:\.\d+)?)"
@@ -384,10 +385,10 @@ def buildable_delta(printer: Printer) -> Printer:
             found=f"rods of {printer.rod.min():g} mm, a radius of {printer.radius:g} mm",
             expected="both in mm, as the firmware has them",
         )
-    # towers closer than half of their regular spacing of 120 degrees
+    # towers all on one side of the bed's middle, which is outside of their triangle
     apart = np.sort(np.mod(printer.angle, 360))
     gaps = np.diff(np.append(apart, apart[0] + 360))
-    if gaps.min() < 60:
+    if gaps.max() >= 180:
         raise InputError(
             "two towers stand in nearly one direction",
             where=printer.label,

@@ -278,6 +278,7 @@ def analyzed_distances(text: str, label: str, printer: Printer) -> PrintedPart |
                 words[name] = []
     if not words.keys() & ANALYZED.keys():
         return None
+    # an object of 148 mm has a size of 1.5 mm or 15 m beyond these scales
     scale = words.get("SCALE", [1.0])
     wrong = [name for name, size in ANALYZED.items() if len(words.get(name, ())) != size]
     if wrong or len(scale) != 1 or not 0.01 < scale[0] < 100:

@@ -29,7 +29,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
 from pkmcal.identify.state import State, estimated_unknowns
-from pkmcal.levels import ROUNDING
+from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.layout import LimbLayout
 
@@ -50,10 +50,10 @@ class Gauge(Protocol):
 FRAME_CHANGE_ROUNDING = 1e-12
 """Value after a change of frames that is rounding, relative to the machine's size, or to 1 for
 directions: some thousand times the rounding of a double."""
-COLLINEAR_POINTS_SINE = 1e-3
-"""Distance of three points from one line, relative to their distances, below which they determine
-no rotation about it: a frame by them would enlarge errors a thousandfold. Not checked within a
-factor of two."""
+COLLINEAR_POINTS_SINE = NEGLIGIBLE
+"""Distance of three points from one line, relative to their distances, below which their
+information on the rotation about it is negligible, as in registration. Then the frame is another
+one, which changes coordinates but no figure of the machine."""
 
 
 @dataclass(frozen=True)

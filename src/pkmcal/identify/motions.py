@@ -34,9 +34,6 @@ form about as many."""
 MOST_SIZES = 3
 """Largest number of sizes that are tried together, besides all of them; the number of combinations
 grows as powers of two."""
-SMALL_PART = 0.05
-"""Share of the larger of two shifts up to which their sum is none, and of the joints' spread up to
-which a joint lies on an axis: the poses at which motions are computed contain noise."""
 MOST_VALUES_LISTED = 5
 """Largest number of terms in a sentence, the last of which may stand for all smaller ones."""
 
@@ -55,8 +52,7 @@ class UnidentifiedOptions:
     # squared cosines between a motion and the undetermined space above which the motion explains a
     # part of that space. The larger one is applied first, since many motions are similar once
     # frames are removed; the smaller one allows for the noise of the poses at which the space was
-    # evaluated. They affect the wording only; not checked within a factor of two of their distance
-    # from 1
+    # evaluated. They choose among sentences on one space; the motions' sum is the same
     inside: tuple[float, float] = (0.999, 0.95)
     # information in units of the prior (singular value) below which a direction counts as
     # unidentified: the data then leave nearly all of its variance, 1 / (1 + weak^2). Estimated
@@ -345,7 +341,7 @@ def _sliding(_s: Situation, coefficients: Array) -> str:
         if base > platform:
             return "can grow while its base joint moves back along it"
         return "can grow while its platform joint moves on along it"
-    if abs(coefficients[0].sum()) < SMALL_PART * max(base, platform):
+    if abs(coefficients[0].sum()) < NAMED_SHARE * max(base, platform):
         return "can shift along itself with both joints"
     return "can grow while both of its joints move along it"
 
@@ -638,10 +634,10 @@ def _line(
     square = float(omega @ omega)
     point, direction = middle + cross(omega, tau) / square, omega / np.sqrt(square)
     axis = _axis_name(direction)
-    if abs(float(omega @ tau) / square) > SMALL_PART * spread:
+    if abs(float(omega @ tau) / square) > NAMED_SHARE * spread:
         return f"{axis or 'an axis'} and shift along it at once"
     distance = np.linalg.norm(np.cross(points - point, direction), axis=-1)
-    on = [j for j in np.flatnonzero(distance < SMALL_PART * spread) if j not in legs]
+    on = [j for j in np.flatnonzero(distance < NAMED_SHARE * spread) if j not in legs]
     if len(on) >= 2:
         return f"the axis through joints {joined([str(j + 1) for j in on])}"
     if len(on) == 1:

@@ -38,19 +38,19 @@ from pkmcal.identify.row_sums import GroupRows, group_rows
 from pkmcal.levels import NEGLIGIBLE, UNEXPLAINED_SCALE
 from pkmcal.measurements.rows import RowGroups
 
-LEAST_NOISE_FREEDOM = 5.0
-"""Degrees of freedom n below which a sum of squares determines no noise: the relative standard
-deviation 1 / sqrt(2 n) of the noise is a third; it is 0.45 with half, 0.22 with twice this
-number."""
+LEAST_NOISE_FREEDOM = 4.0
+"""Degrees of freedom up to which a sum of squares determines no noise: the weight of measurements
+is the inverse of their estimated variance, and the inverse of a chi-squared sum has a variance for
+more than four degrees of freedom only."""
 
 
 @dataclass(frozen=True)
 class NoiseOptions:
     """Constants of the restricted likelihood of a noise."""
 
-    # probability of contradicting a noise that is stated correctly: one in a hundred, shared by the
-    # three kinds of rows
-    contradiction_chance: float = 0.01 / 3
+    # probability of contradicting a noise that is stated correctly: a negligible one, as of cells
+    # of the report's residuals, shared by the three kinds of rows
+    contradiction_chance: float = NEGLIGIBLE / 3
     # largest factor on a noise in one step, beyond which the linear model no longer holds
     largest_step: float = 10.0
     # largest number of rows whose residuals are decorrelated together. More rows are handled in

@@ -24,6 +24,7 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.measured_platform import taken
+from pkmcal.levels import FALSE_ALARM
 from pkmcal.measurements import PoseSet
 from pkmcal.measurements.poses import turn_jacobian
 from pkmcal.mechanisms.document import MOTION_DIRECTIONS
@@ -31,10 +32,6 @@ from pkmcal.mechanisms.document import MOTION_DIRECTIONS
 Turning = Literal["none", "one axis", "any"]
 TURNING_BY_FREEDOMS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}
 """Hypothesis by the number of rotations in a machine's motion."""
-LEAST_PAIR_TURN = np.radians(10.0)
-"""Rotations (rad) between two poses below which their axis is ignored: its noise grows as 1 /
-rotation. It affects the spread that is reported, not the test. Not checked within a factor of
-two."""
 ROTATION_AXIS_STEPS = 10
 MOST_TURN_PAIRS = 200_000
 
@@ -193,13 +190,16 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     """RMS scatter (rad) of the axes of rotation between two poses, and its value from noise alone.
 
     In the camera frame. A rotation phi with noise n of its two poses moves the axis by n / (2
-    sin(phi / 2)) across.
+    sin(phi / 2)) across. Pairs that noise alone may have turned have no axis.
     """
-    # rotations of all pairs that turn enough
+    from scipy.special import chdtri
+
+    # rotations of all pairs that turn by more than noise
     i, j = _pairs(len(rot))
     turn = rotation_vector(rot[j] @ rot[i].mT)
     angle = np.sqrt(dot(turn, turn))
-    used = angle > LEAST_PAIR_TURN
+    square = dot(np.linalg.solve(noise[i] + noise[j], turn[..., None])[..., 0], turn)
+    used = square > chdtri(3, FALSE_ALARM / max(len(turn), 1))
     if used.sum() < 2:
         return np.nan, np.nan
     i, j, turn, angle = i[used], j[used], turn[used], angle[used]

@@ -19,11 +19,12 @@ from pkmcal.identify.sentences import negligible_shift
 from pkmcal.identify.tool import centres_and_tool, platform_sigma
 from pkmcal.identify.unidentified import Identification
 from pkmcal.levels import (
-    CAUSE_SHARE,
     CONTRADICTION_SIGMAS,
     FEW,
     MAJORITY,
+    NEARLY_ALL,
     NEGLIGIBLE,
+    NOISE_EXCESS,
     ROUNDING,
     UNEXPLAINED_SCALE,
 )
@@ -55,9 +56,12 @@ class VerdictOptions:
 
     # noise scale above which the model does not explain the measurements
     too_noisy: float = UNEXPLAINED_SCALE
-    # share of rejected edges beyond which the remaining ones may be the outliers: a tenth below the
-    # half at which a robust estimate breaks down. Not checked within a factor of two
-    too_many_rejected: float = 0.4
+    # share of rejected edges beyond which the noise of the others is not known: 0.37. The search
+    # begins with the noise by the median of the norms of pairs of residuals. With a share e of
+    # outliers, however far away, that is the quantile q = 1 / (2 (1 - e)) of the others (the
+    # median's maximum bias: P. J. Huber, Robust Statistics, 1981), which relative to their median
+    # is the root of -log2(1 - q) for the norm of two normal errors: NOISE_EXCESS here
+    too_many_rejected: float = 1 - MAJORITY / (1 - 2 ** -(NOISE_EXCESS**2))
     # limit of the undetermined part of the platform's error by the nominal model. A calibration
     # reduces that error by a factor of twenty to fifty; an undetermined twentieth would be the
     # largest error of the result, and more images of the same kind do not reduce it. With half or
@@ -72,13 +76,15 @@ class VerdictOptions:
     worth_reporting: float = 0.5
     # share of configurations near a singular pose above which the estimate is not reliable
     singular_share: float = MAJORITY
-    # share of the undetermined displacement above which one motion is a reason of its own
-    large_cause_share: float = CAUSE_SHARE
+    # share of the undetermined displacement above which one motion is a reason of its own: without
+    # a smaller one nearly all of its square remains
+    large_cause_share: float = (1 - NEARLY_ALL) ** 0.5
     # limit of the result's standard deviation relative to that by the prior sigmas. If the six
-    # numbers of a pose have independent normal errors, the result is nearer to the truth than the
-    # nominal model with a probability of 94 % at this limit, 99.8 % at half of it, and 50 % at
-    # twice (F distribution); new values are then not worth their risk
-    nominal_error_share: float = 0.5
+    # numbers of a pose have independent normal errors, the squared errors of the nominal model and
+    # of the result, each by its variance, have the ratio F(6, 6), whose quantile of the level of
+    # reports, one in twenty, is 0.483^2 and its inverse: at this limit the result is farther from
+    # the truth than the nominal model in one of twenty cases
+    nominal_error_share: float = 0.483
     # residual of a reading, in standard deviations, above which it contradicts the images, and the
     # share of such readings that is a reason
     reading_residual: float = CONTRADICTION_SIGMAS

@@ -33,7 +33,7 @@ ROTATION_STEPS = 50
 """Maximum number of Gauss-Newton steps for the best rotation; two or three suffice for equal
 lenses."""
 
-LEAST_MODE = 0.01
+LEAST_MODE = NEGLIGIBLE
 """Standard deviation of a mode of the difference, as a share of the largest, below which changes of
 second order exceed it.
 

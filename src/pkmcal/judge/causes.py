@@ -25,9 +25,9 @@ from pkmcal.wording import split_name
 
 JointSide = Literal["base", "platform"]
 JOINT_SIDES: tuple[JointSide, JointSide] = ("base", "platform")
-COMMON_MOUNT_RATIO = 0.7
-"""Maximum distance of two joints on a common mount, relative to the distance of the next joint: in
-a regular hexagon of joints the ratio is 1. Not checked within a factor of two."""
+COMMON_MOUNT_RATIO = 0.5
+"""Maximum distance of two joints on a common mount, relative to the distance of the next joint:
+half of it, up to which the circles about the pairs do not overlap."""
 
 
 @dataclass(frozen=True)

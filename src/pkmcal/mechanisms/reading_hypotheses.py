@@ -18,6 +18,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.outcome.hypotheses import Hypothesis, parameter_cost
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
@@ -32,8 +33,9 @@ class ReadingHypothesisOptions:
     # constants that are tried for a reversed motor in one stroke: one that is half a step off moves
     # the platform by a thirtieth of the stroke, a tenth of what the reversed readings do
     constants_in_a_stroke: int = 16
-    # prior share of single readings that are wrong, such as mistyped ones
-    slip_share: float = 0.01
+    # prior share of single readings that are wrong, such as mistyped ones: as many as are no reason
+    # against a result
+    slip_share: float = NEGLIGIBLE
     # decades about the width of a range over which a wrong reading may be
     slip_decades: float = 6.0
 

@@ -97,7 +97,7 @@ class ImageLocalizationOptions:
     folds: tuple[int, ...] = (2, 3, 4, 6)
     # largest distance between a rotated joint and its counterpart in a symmetric pose, relative to
     # the radius of the base. No real parts are exactly interchangeable, but in an image they look
-    # so
+    # so: a leg as long as that radius is turned by the 11 degrees within which edges count (0.2)
     joint_distance: float = 0.2
     # rounds of the search near a pose; refine_local ends with the first that gains nothing
     near_rounds: int = 3

@@ -144,12 +144,12 @@ class LegSearchOptions:
     gradient_half: float = 1.5
     # ratio of the second best score to the best one from which a leg's position is ambiguous
     rival_share: float = 0.95
-    # fewest visible edge points for the search of a leg, of which each edge has as many as samples
-    fewest: int = 8
     # standard deviation of edges from the search: one step of it
     sigma: float = 1.0
     # number of points along an edge
     samples: int = 12
+    # fewest visible points of a leg's two edges with which it is searched
+    fewest: int = round(FEW * 2 * samples)
     # share of a leg's points below which it counts as hidden instead of not found
     in_sight: float = 1 - NEARLY_ALL
     # distance from the outlines of other legs

@@ -23,7 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot
-from pkmcal.levels import MAJORITY, OUTLIER_SIGMAS
+from pkmcal.levels import CONTRADICTION_SIGMAS, MAJORITY, OUTLIER_SIGMAS
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import EdgePoints, TubeList
 from pkmcal.solver.kernels import cauchy_weights
@@ -43,8 +43,9 @@ class ProfileOptions:
     # share of a leg's half width, inwards from its limb, that the model explains: highlights of
     # bare metal begin further inside; on slim legs this is less than the reach
     limb_share: float = 0.45
-    # smallest depth that is used: a shallower part would not contain the brightness of the limb
-    # itself, behind a blur of 0.7 px
+    # smallest depth that is used, between two samples: up to the first one at which a step, blurred
+    # by the usual 0.7 px, has nearly all of its height, the one at 1 px (nine tenths at 1.28
+    # standard deviations, 0.9 px); any depth from 1 to less than 1.5 px has the same samples
     least_inside: float = 1.25
     # distance outward of the predicted edge from which samples belong to the background: more than
     # its blur
@@ -93,11 +94,11 @@ class ProfileOptions:
     shading_slope: float = 0.3
     # prior sigma of the shading's root part at a depth of a pixel, contrasts
     shading_root: float = 1.0
-    # smallest grey level of a clipped sample: interpolation and compression blur 255 by a few
-    # levels
-    saturated: int = 250
+    # smallest grey level of a clipped sample: interpolation and compression blur 255, by less than
+    # five times the noise of one level
+    saturated: int = 255 - int(CONTRADICTION_SIGMAS)
     # position up to which a profile may be clipped: the edge itself, half a sample inside
-    most_cut: float = -0.25
+    most_cut: float = -step / 2
     # largest distance of a profile's edge from that of its leg as a whole: further away are
     # highlights, which all points of an edge may show consistently
     own_edge: float = 0.5

@@ -19,8 +19,9 @@ from pkmcal.observe.profiles import PROFILE_OPTIONS
 class QualityOptions:
     """Constants of the quality of images."""
 
-    # largest grey level of a black sample: shading and edges are lost in noise
-    black: int = 8
+    # largest grey level of a black sample, as far from black as a clipped one is from white:
+    # shading and edges are lost in noise
+    black: int = 255 - PROFILE_OPTIONS.saturated
     # smallest grey level of a clipped sample
     saturated: int = PROFILE_OPTIONS.saturated
     # depths inside an edge at which exposure is sampled, in half widths of the leg
@@ -33,9 +34,11 @@ class QualityOptions:
     # pixels from the steepest point within which a blurred edge attains its full contrast: three
     # times a blur of two
     flank: float = 6.0
-    # smallest contrast, in grey levels, of an edge from which the blur is estimated in spite of
-    # noise
-    least_contrast: float = 30.0
+    # smallest contrast, in grey levels, of an edge from which the blur is estimated. Its slope, by
+    # two samples two steps apart, has the noise of one level times the root of two per pixel; of
+    # the contrast C and the largest blur s that is still measured, 1.74 px, it is C / (s sqrt(2
+    # pi)). From 31 levels on the blur of one edge is known to a fifth, RELEVANT_FACTOR
+    least_contrast: float = 31.0
     # percentile of the edges' widths that is taken as the lens's blur; shading widens the other
     # edges
     percentile: float = 25.0

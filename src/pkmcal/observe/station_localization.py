@@ -22,6 +22,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import angle_between, inverse, pose, rotation
+from pkmcal.levels import NEARLY_ALL
 from pkmcal.observe.image_localization import PoseHypotheses
 from pkmcal.observe.pose_candidates import CANDIDATE_OPTIONS, CandidateOptions, global_candidates
 from pkmcal.observe.pose_likelihood import (
@@ -140,14 +141,15 @@ class LocalizationOptions:
     fewest_for_thirds: int = 5
     # the same as for halves, with a prior: around a rough pose two images suffice for a search
     fewest_for_halves_with_prior: int = 4
-    # probability by chance, from some of the images, below which the others are not searched
-    # without a prior (statistical)
-    early: float = 1e-4
     # probability of so large a likelihood by chance below which the machine is localized without a
     # prior (statistical)
     false_alarm: float = math.exp(-HYPOTHESIS_THRESHOLDS.act)
-    # the same near a hand-placed pose, which is evidence itself (statistical)
-    false_alarm_with_prior: float = 1e-2
+    # the same from some of the images, below which the others are not searched without a prior: by
+    # the union bound it adds a tenth to the false alarms (statistical)
+    early: float = false_alarm * (1 - NEARLY_ALL)
+    # the same near a hand-placed pose, if nearly all of these are right: a false alarm is one near
+    # a wrong pose only (statistical)
+    false_alarm_with_prior: float = false_alarm / (1 - NEARLY_ALL)
     # probability of a second pose above which neither is accepted (statistical)
     rival: float = math.exp(-HYPOTHESIS_THRESHOLDS.report)
     # grid of candidates without a prior

@@ -18,7 +18,7 @@ from pkmcal.arrays import Array, Booleans, Integers, enlargement
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
-from pkmcal.levels import NEGLIGIBLE
+from pkmcal.levels import NEARLY_ALL, NEGLIGIBLE
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.images import upright_turns
@@ -40,11 +40,6 @@ FIELD_EDGE_FRACTIONS = np.linspace(0.05, 0.95, 10)
 """Positions on an edge, as fractions of its span: an edge crosses several cells."""
 FIELD_CELLS_ACROSS = 14
 """Cells across the image."""
-LEAST_WEIGHT_ACROSS = np.sin(np.deg2rad(15.0)) ** 2
-"""Least share of a cell's information in a direction in which the shift is shown.
-
-Edges within 15 degrees of one another have no more along themselves: noise, enlarged fourfold.
-"""
 FIELD_ARROW_LENGTH = 0.06
 """Length of a large mean shift as drawn, in image widths."""
 MEAN_IMAGE_WIDTH, MEAN_IMAGES = 640, 12
@@ -309,11 +304,11 @@ def _cells(
         np.add.at(out, number_of, values)
         return out
 
-    # per cell: least squares for the shift s in sum (d d^T) s = sum d value, restricted to
-    # well-determined directions
+    # per cell: least squares for the shift s in sum (d d^T) s = sum d value, without a direction
+    # that has little of the information, nearly all of which is across parallel edges
     information = total(direction[:, :, None] * direction[:, None])
     strength, axes = np.linalg.eigh(information)
-    strong = strength > LEAST_WEIGHT_ACROSS * strength.sum(axis=1, keepdims=True)
+    strong = strength > (1 - NEARLY_ALL) * strength.sum(axis=1, keepdims=True)
     along = np.einsum("cij,ci->cj", axes, total(direction * value[:, None]))
     shift = np.einsum(
         "cij,cj->ci", axes, np.where(strong, along / np.maximum(strength, 1e-12), 0.0)

@@ -12,8 +12,8 @@ from pkmcal.measurements import Column
 from pkmcal.wording import amount
 
 FEWEST_BESIDE_MOVEMENT = 3
-"""Configurations on either side of a movement: fewer are outliers. Not checked with
-other numbers."""
+"""Configurations on either side of a movement: of three, the fewest of which most can agree
+against one, two contradict an outlier."""
 MOVEMENT_MOMENTS_TRIED = 12
 """Times at most, spread over a station's configurations, at which it may have moved."""
 

@@ -67,13 +67,14 @@ from pkmcal.identify.methods.registration import (
 )
 from pkmcal.identify.nominal_joints import NominalJoints, base_gauge, nominal_joints, platform_gauge
 from pkmcal.identify.state import State
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 FourStepForm = Literal["corrected", "printed"]
-VAGUE_CENTRE_SHARE = 0.1
-"""Standard deviation of a base centre, relative to the base's size, above which it is rejected. Not
-checked within a factor of two."""
+VAGUE_CENTRE_SHARE = NEGLIGIBLE**0.5
+"""Standard deviation of a base centre, relative to the base's size, above which it is rejected: the
+distance of such a centre from another one is biased by the square of this share."""
 
 
 @dataclass(frozen=True)
@@ -331,8 +332,8 @@ def four_step(
 
 
 def _determined_mask(value: linear.LinearCentres, machine: Machine) -> Booleans:
-    """(S, L) base centres whose standard deviation is below VAGUE_CENTRE_SHARE of the
-    base's size.
+    """(S, L) base centres whose standard deviation is below VAGUE_CENTRE_SHARE of the base's
+    size.
     """
     size = extent(machine.base_centers())
     finite = np.all(np.isfinite(value.centres), axis=-1)

@@ -20,13 +20,10 @@ from pkmcal.identify.methods.four_step_platform import (
 from pkmcal.identify.methods.leg_axes import Axes, in_base
 from pkmcal.identify.methods.registration import fixes_pose, loose, parts_of
 from pkmcal.identify.nominal_joints import NominalJoints, nominal_joints
-from pkmcal.levels import CAUSE_SHARE, MAJORITY
+from pkmcal.levels import MAJORITY, NAMED_SHARE, ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import named
 
-FREE_OFFSETS_SINGULAR_VALUE = 1e-3
-"""Singular value of the distances' derivatives by the offsets, relative to at most 1 for an image,
-below which a combination of offsets is unidentifiable. Not checked within a factor of two."""
 USE_JOINT_METHOD = "use the joint method (bundle)"
 
 
@@ -200,13 +197,12 @@ def lengths_are_fixed(
     values, vectors = np.linalg.eigh(slopes[:, legs.closing].T @ slopes[:, legs.closing])
     sigma = np.sqrt(np.sum(value**2) / freedom / np.maximum(values, 1e-300))
     length = float(np.mean(legs.rod[legs.closing] + merged.readings[0][:, legs.closing]))
-    free = (values < FREE_OFFSETS_SINGULAR_VALUE**2 * len(merged.configuration)) | (
-        sigma > MAJORITY * length
-    )
+    # no derivative but rounding (each image's is at most 1), or more noise than length
+    free = (values < ROUNDING * len(merged.configuration)) | (sigma > MAJORITY * length)
     if not free.any():
         return
     part = np.abs(vectors[:, free]).max(axis=1)
-    names = np.flatnonzero(legs.closing)[part > CAUSE_SHARE * part.max()]
+    names = np.flatnonzero(legs.closing)[part > NAMED_SHARE * part.max()]
     raise ResultError(
         what=f"the images do not determine the lengths of {named(names)}",
         found="distances between platform joints that do not depend on a combination of them",
