@@ -54,6 +54,7 @@ from pkmcal.files.refusals import next_step_after
 from pkmcal.files.regular import check_regular, resolved
 from pkmcal.files.schema import Schema, validated_document
 from pkmcal.files.tables import CsvTable, PairTable, csv_text, read_csv, read_pairs
+from pkmcal.files.versions import versions
 from pkmcal.files.writing import (
     alone_in,
     check_own_folder,
@@ -129,6 +130,7 @@ __all__ = [
     "staged_file",
     "staged_folder",
     "validated_document",
+    "versions",
     "wanted_file",
     "with_exif",
     "with_numbers",
