@@ -11,6 +11,7 @@ from pkmcal.files import (
     remember_arrays,
     remembered,
     remembered_arrays,
+    versions,
 )
 
 
@@ -73,3 +74,10 @@ def test_a_digest_follows_values_and_types():
     parts = [np.zeros(3), np.zeros(3, dtype=int), np.zeros((3, 1)), np.array([0, 0, 1.0]), [0], "0"]
     assert len({digest_of(part) for part in parts}) == len(parts)
     assert digest_of(np.zeros(3), "a") == digest_of(np.zeros(3), "a")
+
+
+def test_a_digest_follows_the_versions_of_packages():
+    usual = versions()
+    assert {"numpy", "scipy", "opencv-contrib-python-headless"} <= usual.keys()
+    assert digest_of("a", packages=usual) == digest_of("a")
+    assert all(digest_of("a", packages={**usual, name: "0"}) != digest_of("a") for name in usual)

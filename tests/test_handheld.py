@@ -770,8 +770,15 @@ def test_the_same_images_are_searched_once(searched):
     assert session_name(session, stations, Boards(), unplaced) == path.stem
     noisier = replace(session, joint_noise=2 * session.joint_noise)
     warmer = replace(session, temperature=np.array([20.0, 21.0, 22.0]))
-    for other in (noisier, warmer):
+    separate = tuple(
+        replace(station, camera_file=f"{k}.yaml") for k, station in enumerate(session.stations)
+    )
+    for other in (noisier, warmer, replace(session, stations=separate)):
         assert session_name(other, stations, Boards(), unplaced) != path.stem
+    # a single image is searched at the pose by its readings, whatever their temperature
+    np.testing.assert_array_equal(warmer.forward.T_base_platform, session.forward.T_base_platform)
+    machine = session.machine
+    assert image_name(warmer, machine, 0) == image_name(session, machine, 0)
     boards = Boards(tolerance=0.01)
     assert session_name(session, stations, boards, unplaced) != path.stem
     # a file of something else under the right name

@@ -31,8 +31,10 @@ from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.findings import SweepResult, clustered, with_error
 from pkmcal.studies.statistics import Summary, covered
+from pkmcal.studies.store import plainly
 from pkmcal.studies.study_report import study_document
 from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
+from pkmcal.studies.varied import DESIGN_NAMES_VARIED
 from pkmcal.wording import brief
 
 SMALL = ("--vary", "configurations=6", "--vary", "stations=1,2")
@@ -135,6 +137,31 @@ def test_a_machine_of_another_size_is_the_same_machine(name):
     factor = np.where(lengths, 2.0, 1.0)[:, None]
     np.testing.assert_allclose(two.joint_ranges, factor * one.joint_ranges)
     np.testing.assert_array_equal(two.parameters.tolerance, one.parameters.tolerance)
+
+
+ANOTHER_VALUE = {
+    "resolution": 800, "focal": 900, "distance": 1.7, "elevation": 35, "stations": 2,
+    "configurations": 3, "edge_noise": 0.2, "corner_noise": 0.1, "shading": 0.1,
+    "reading_noise": 1e-5, "radius": 1.2, "size": 1.1, "tolerance": 0.5, "extreme": 1,
+    "observe": "legs+board", "camera": "mirror",
+}  # fmt: skip
+"""Value of each name other than that of the usual design."""
+
+
+@pytest.mark.parametrize("name", DESIGN_NAMES_VARIED)
+def test_each_name_changes_the_simulated_session(name):
+    observed = "legs+board" if name == "corner_noise" else "legs"
+    usual = {"observe": observed, "configurations": 2, "stations": 1}
+    assert drawn(usual | {name: ANOTHER_VALUE[name]}) != drawn(usual)
+
+
+def drawn(vary):
+    """Truth and measurements of a simulated session."""
+    design = design_of("gough-stewart", *(f"{name}={value}" for name, value in vary.items()))
+    setting = SimulatedCalibrations(design)
+    data = setting.draw(batch_of(setting, runs=1))
+    problem = data.assembled.problem
+    return plainly([data.theta, data.poses, problem.data, problem.pose_data])
 
 
 def test_cameras_change_as_stated():

@@ -1,8 +1,9 @@
 """Localization of hand-held images in the user's cache folder.
 
-The digest of image files, cameras, readings, temperatures, boards and nominal model names the
-result, so that every command that localizes the same images uses the same poses, and images are
-searched once.
+The digest of all that a result depends on is its name, so that every command that localizes the
+same images uses the same poses, and images are searched once: :func:`session_name` for all images,
+:func:`image_name` for one image by itself, and :func:`pkmcal.files.digest_of` for the program and
+the versions of NumPy, SciPy and OpenCV.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ Localized = tuple[dict[int, PoseHypotheses], PriorScene]
 
 
 def image_name(session: Session, machine: Machine, station: int) -> str:
-    """Name of the localization of one hand-held image by itself.
-
-    machine : by which the image is localized.
+    """Name of the localization of one hand-held image by itself: the machine by which it is
+    localized, the image's readings, and the image's file, camera and rough pose.
     """
+    # Temperatures do not enter: the image is compared with the pose at the readings as they are.
+    # They correct readings in the joint estimate, so the name of all images has them.
     readings = session.joints[session.stations[station].images[0].configuration]
     digest = digest_of(machine.to_document(), machine.values, readings, _stated(session, station))
     return f"image-{digest}"
@@ -41,7 +43,9 @@ def image_name(session: Session, machine: Machine, station: int) -> str:
 def session_name(
     session: Session, stations: Sequence[int], boards: Boards, scene: PriorScene
 ) -> str:
-    """Name of the localization of all hand-held images.
+    """Name of the localization of all hand-held images: the nominal model, readings, their noise
+    and temperatures, image files, cameras, rough poses and names of stations, boards, and poses of
+    the stations that were localized before.
 
     stations : that observe legs. scene : of the nominal model.
     """
@@ -53,7 +57,11 @@ def session_name(
         session.joints,
         session.joint_noise,
         np.zeros(0) if temperature is None else temperature,
-        [[k, session.stations[k].handheld, _stated(session, k)] for k in stations],
+        [
+            [k, session.label(k), session.stations[k].handheld, _stated(session, k)]
+            for k in stations
+        ],
+        session.camera_of_station,  # stations with one camera share its edge shift
         [k for k, _ in stood],
         *(np.zeros(0) if T is None else T for _, T in stood),
         [boards.body, boards.tolerance],

@@ -7,12 +7,9 @@ dates, so that the same session gives the same file except for timings.
 
 from __future__ import annotations
 
-import platform
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +22,7 @@ from pkmcal.calibration.file_names import (
     CALIBRATION_REPORT_FILE,
 )
 from pkmcal.errors import InputError, legible
-from pkmcal.files import check_writable, entries, json_text, json_value, resolved
+from pkmcal.files import check_writable, entries, json_text, json_value, resolved, versions
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import identified
@@ -48,7 +45,6 @@ CALIBRATION_RESULT_FILES = (
 CAMERA_FILE = re.compile(r"camera-.+\.yaml")
 """Files of cameras that were refined with the machine."""
 FORMAT_KEY, CALIBRATION_FORMAT = "pkmcal_calibration", 1
-PACKAGES_WITH_VERSION = ("numpy", "scipy", "opencv-contrib-python-headless")
 CALIBRATION_CONVENTIONS = (
     "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = scale * reading +"
     " offset. Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, and"
@@ -137,7 +133,7 @@ def calibrated_mechanism_text(calibration: Calibration) -> str:
     verdict = calibration.verdict
     name = resolved(calibration.session.folder).name
     lines = [
-        f"Calibrated by pkmcal {version('pkmcal')} from the session {name}"
+        f"Calibrated by pkmcal {versions()['pkmcal']} from the session {name}"
         f" (method {calibration.method}, seed {calibration.seed}).",
         verdict.headline if verdict.usable else "NOT TO BE USED: " + " ".join(verdict.reasons),
         f"Frames: {calibration.estimate.gauge}. Lengths in metres.",
@@ -217,18 +213,6 @@ def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
         {"tube": k, "scale": scale, "shading": shading, "tails": tails}
         for k, (scale, shading, tails) in enumerate(rows, start=1)
     ]
-
-
-@cache
-def versions() -> Mapping[str, str]:
-    """Versions of pkmcal, Python and the packages that numbers depend on."""
-    results = {"pkmcal": version("pkmcal"), "python": platform.python_version()}
-    for name in PACKAGES_WITH_VERSION:
-        try:
-            results[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return results
 
 
 def identifiability_of(identification: Identification) -> dict[str, Any]:

@@ -54,6 +54,7 @@ from pkmcal.files.refusals import next_step_after
 from pkmcal.files.regular import check_regular, resolved
 from pkmcal.files.schema import FieldError, Schema, validated_document
 from pkmcal.files.tables import CsvTable, PairTable, csv_text, read_csv, read_pairs
+from pkmcal.files.versions import versions
 from pkmcal.files.writing import (
     alone_in,
     check_own_folder,
@@ -130,6 +131,7 @@ __all__ = [
     "staged_file",
     "staged_folder",
     "validated_document",
+    "versions",
     "wanted_file",
     "with_exif",
     "with_numbers",

@@ -1,6 +1,7 @@
 """Arrays in the user's cache folder, under names made from the digest of all that they depend on.
 
-A file that is damaged counts as absent; files of another version of the program have other names.
+A file that is damaged counts as absent. Files of another version of the program, or of the packages
+that numbers depend on, have other names.
 """
 
 from __future__ import annotations
@@ -20,17 +21,21 @@ import numpy as np
 
 from pkmcal.files.cache import cache_folder, remember, remembered
 from pkmcal.files.documents import json_text
+from pkmcal.files.versions import versions
 
 MOST_CACHED_BYTES = 2**28
 """Size of all cached arrays above which the oldest are removed."""
 _ENDING = ".npz"
 
 
-def digest_of(*parts: Any) -> str:
-    """Digest of arrays and plain data, and of the program itself, for the name of a result that
-    depends on nothing else.
+def digest_of(*parts: Any, packages: Mapping[str, str] | None = None) -> str:
+    """Digest of arrays and plain data, of the program's source, and of the versions of packages,
+    for the name of a result that depends on nothing else.
+
+    packages : versions by name; by default those in use (:func:`pkmcal.files.versions`).
     """
-    digest = blake2b(_program_digest(), digest_size=16)
+    digest = blake2b(_source_digest(), digest_size=16)
+    digest.update(json_text(versions() if packages is None else packages).encode())
     for part in parts:
         if isinstance(part, np.ndarray):
             digest.update(f"{part.dtype.str} {part.shape} ".encode())
@@ -41,8 +46,8 @@ def digest_of(*parts: Any) -> str:
 
 
 @cache
-def _program_digest() -> bytes:
-    """Digest of the program's source, so that no version uses another one's results."""
+def _source_digest() -> bytes:
+    """Digest of the program's source, which changes between releases too."""
     digest, package = blake2b(), Path(__file__).parents[1]
     for path in sorted(package.rglob("*.py")):
         digest.update(path.read_bytes())

@@ -68,9 +68,10 @@ class VerdictOptions:
     # twice the limit, refusals with a part between these become warnings or the reverse; how many
     # was not checked
     undetermined_share: float = 0.05
-    # share of the platform's variance due to noise above which the undetermined part is accepted,
-    # since it hardly increases the standard deviation
-    least_noise_share: float = FEW
+    # share of the platform's variance due to noise above which the undetermined part is accepted:
+    # more of the same images then reduce the standard deviation, which the undetermined part
+    # increases by a factor of less than the root of three. Not checked within a factor of two
+    least_noise_share: float = 1 / 3
     # displacement by one undetermined motion, relative to the platform's standard deviation, that
     # causes a warning: one half increases the standard deviation by an eighth
     worth_reporting: float = 0.5

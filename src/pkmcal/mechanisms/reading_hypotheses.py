@@ -46,9 +46,9 @@ OTHER_UNITS = {"m": 1e-3, "rad": pi / 180}
 
 ReadingHypothesis = Hypothesis[Array]
 """Data of these hypotheses are readings (K, m), m or rad. Facts: ``motors``, the columns (from 0)
-of one motor or two; ``constant`` of a reversed motor, the sum (m or rad) of a reading and the joint
-value that it stands for, 0 for a wrong sign alone; ``order`` (m,), the column of each leg;
-``step``, by how many rows the readings come late."""
+of one motor, or of the two that are exchanged; ``constant`` of a reversed motor, the sum (m or rad)
+of a reading and the joint value that it stands for, 0 for a wrong sign alone; ``order`` (m,), the
+column of each leg; ``step``, by how many rows the readings come late."""
 
 
 def reading_hypotheses(

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.results import base_camera_covariance, versions
+from pkmcal.calibration.results import base_camera_covariance
+from pkmcal.files import versions
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.edge_noise import EDGE_NOISE
 from pkmcal.identify.estimate import Estimate, GroupStatistics
