@@ -23,7 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.circles import LEAST_WINDOW_RADIUS, circle_centres, find_circles
-from pkmcal.boards.saddles import SADDLE_OPTIONS, is_large_enough, largest_block
+from pkmcal.boards.saddles import largest_block
 from pkmcal.levels import NEARLY_ALL
 from pkmcal.observe.images import narrowed
 from pkmcal.solver.marquardt import Damping
@@ -75,9 +75,6 @@ class BoardDetectionOptions:
     # markers; one way takes ten
     # seconds on a cluttered image of twelve megapixels (measured)
     searched_width: int = 1600
-    # share of the corners inside a chessboard of which all neighbours must be seen; a corner in
-    # glare, or covered, costs up to nine
-    visible_share: float = 0.2
     # fewest markers visible of a ChArUco board, six corners of which lie between six, and of a grid
     least_charuco_markers: int = 4
     least_grid_markers: int = 2
@@ -87,8 +84,6 @@ class BoardDetectionOptions:
     dark_border: float = 0.7
     least_light: float = 0.1
     marker_contrast: float = 10.0
-    # share of a square by which a corner may lie off the middle of its two neighbours' line
-    bend: float = SADDLE_OPTIONS.bend
 
 
 BOARD_DETECTION_OPTIONS = BoardDetectionOptions()
@@ -334,11 +329,11 @@ def find_chessboard(
     """
     if block is None:
         block = largest_block(narrowed(image, options.searched_width)[0])
-    if not is_large_enough(block, counts, options.visible_share):
+    if not block:
         return None
     for pixels in _attempts(image, counts, quick, options):
         grid = pixels.reshape(counts[1], counts[0], 2)
-        if _is_grid(grid, options):
+        if _is_grid(grid):
             return _oriented(image, grid).reshape(-1, 2)
     return None
 
@@ -381,22 +376,17 @@ def _pictures(
     yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0 * scale
 
 
-def _is_grid(grid: Array, options: BoardDetectionOptions) -> bool:
-    """Corners in order: every one near the middle between its neighbours, no row crossing."""
-    for axis in (0, 1):
-        step = np.diff(grid, axis=axis)
-        length = np.linalg.norm(step, axis=-1)
-        bend = np.linalg.norm(np.diff(step, axis=axis), axis=-1)
-        near = np.minimum(*np.split(np.stack([
-            np.take(length, range(length.shape[axis] - 1), axis),
-            np.take(length, range(1, length.shape[axis]), axis),
-        ]), 2))[0]  # fmt: skip
-        if length.min() < 2 or np.any(bend > options.bend * 2 * near):
-            return False
-    right = grid[:-1, 1:] - grid[:-1, :-1]
-    down = grid[1:, :-1] - grid[:-1, :-1]
-    area = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
-    return bool(np.all(area > 0) or np.all(area < 0))
+def _is_grid(grid: Array) -> bool:
+    """Whether corners (rows, columns, 2) are in order: the images of squares are convex and all
+    have one orientation.
+    """
+    right, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
+    area = [
+        x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]
+        for x in (right[:-1], right[1:])
+        for y in (down[:, :-1], down[:, 1:])
+    ]
+    return bool(np.all(np.array(area) > 0) or np.all(np.array(area) < 0))
 
 
 def _oriented(image: Integers, grid: Array) -> Array:
