@@ -497,7 +497,7 @@ def _other_markers(image: Integers, mine: str, options: OtherBoardOptions) -> st
     best = max(names, key=lambda name: len(detect_markers(few, dictionary(name)).ids))
     ids = {name: detect_markers(image, dictionary(name)).ids for name in {best, mine} & {*names}}
     count = len(ids[best])
-    if count < options.least_markers or (mine in ids and len(ids[mine]) > 0.7 * count):
+    if count < options.least_markers or (mine in ids and len(ids[mine]) > MAJORITY * count):
         return None
     if _dictionary_size(best) == NO_SIZE:
         return f"{count} markers of {best}"
