@@ -43,11 +43,9 @@ class CircleOptions:
     ring: float = 0.85
     # least difference between circle and paper, in standard deviations of the paper
     least_contrast: float = CONTRADICTION_SIGMAS
-    # largest fourth harmonic of a circle's outline, weighted by the fourth power of the radius; a
-    # square has 3/7 (derived). Of simulated grids with pitches of 10 and 20 px, blurs of 0.7 and
-    # 1.8 px and noise of 1 and 4 levels (32 images of either kind), it keeps 90 % of the circles
-    # and 73 % of squares; 3/14 keeps 85 and 66 %, no limit 93 % of both
-    most_angular: float = 0.25
+    # largest median over a grid of the fourth harmonic of an outline, weighted by the fourth power
+    # of the radius: the middle between a circle's, 0, and a square's, 3/7 (derived)
+    most_angular: float = 3 / 14
 
 
 CIRCLE_OPTIONS = CircleOptions()
@@ -80,6 +78,7 @@ def circle_centres(
     centres = start.astype(float)
     grey = image.astype(np.float32)
     good, sigma = np.zeros(len(xy), dtype=bool), np.zeros(len(xy))
+    angular: list[float] = []
     for _ in range(options.passes):
         measured = [
             _centre(grey, xy[i], _homography(xy[near], centres[near]), half, options)
@@ -90,6 +89,10 @@ def circle_centres(
             [old if one is None else one[0] for old, one in zip(centres, measured, strict=True)]
         )
         sigma = np.array([0.0 if one is None else one[1] for one in measured])
+        angular = [one[2] for one in measured if one is not None]
+    # the corners of windows, keys or tiles
+    if good.any() and np.median(angular) > options.most_angular:
+        good[:] = False
     return centres, good, sigma
 
 
@@ -128,8 +131,9 @@ def _homography(xy: Array, pixels: Array) -> Array:
 
 def _centre(
     image: Array, xy: Array, H: Array, half: float, options: CircleOptions
-) -> tuple[Array, float] | None:
-    """Centre (2,) px and its standard deviation; None where nothing round stands out.
+) -> tuple[Array, float, float] | None:
+    """Centre (2,) px, its standard deviation, and the fourth harmonic of the outline; None where
+    nothing stands out.
 
     image : grey levels, float32. xy : (2,) m, place on the board. half : half the distance to the
         nearest circle, m.
@@ -154,14 +158,13 @@ def _centre(
     share = np.where(radius <= 1, (level - grey) / contrast, 0.0)
     total = float(share.sum())
     quartic = ((offsets[..., 0] + 1j * offsets[..., 1]) / half) ** 4
-    if abs(np.sum(share * quartic)) > options.most_angular * abs(np.sum(share * abs(quartic))):
-        return None  # the corners of a window, a key or a tile
+    angular = abs(np.sum(share * quartic)) / abs(np.sum(share * abs(quartic)))
     offset = np.sum(share[..., None] * offsets, axis=(0, 1)) / total
     # White noise of the pixels; their number in a sample cancels.
     spread = float(np.sum(offsets[radius <= 1][:, 0] ** 2))
     sigma = noise / abs(contrast) * np.sqrt(spread) / total / (axis[1] - axis[0])
     centre = _projected(H, xy + offset)
-    return centre, float(max(sigma, 1e-4))
+    return centre, float(max(sigma, 1e-4)), float(angular)
 
 
 def _projected(H: Array, xy: Array) -> Array:

@@ -30,7 +30,7 @@ from pkmcal.boards.layout import (
     another_grid,
     marker_layout,
 )
-from pkmcal.boards.saddles import is_large_enough, largest_block
+from pkmcal.boards.saddles import largest_block
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.levels import MAJORITY, NEARLY_ALL
@@ -393,7 +393,7 @@ def _other_chessboard(
             continue
         if not part and all(n <= m for n, m in zip(sorted(candidate), sorted(counts), strict=True)):
             continue
-        if not is_large_enough(block, candidate, options.visible_share):
+        if block < options.visible_share * (candidate[0] - 2) * (candidate[1] - 2):
             continue
         if _all_corners(image, candidate, options.detection, block):
             return chessboard(candidate, 1.0).described
@@ -497,7 +497,7 @@ def _other_markers(image: Integers, mine: str, options: OtherBoardOptions) -> st
     best = max(names, key=lambda name: len(detect_markers(few, dictionary(name)).ids))
     ids = {name: detect_markers(image, dictionary(name)).ids for name in {best, mine} & {*names}}
     count = len(ids[best])
-    if count < options.least_markers or (mine in ids and len(ids[mine]) > 0.7 * count):
+    if count < options.least_markers or (mine in ids and len(ids[mine]) > MAJORITY * count):
         return None
     if _dictionary_size(best) == NO_SIZE:
         return f"{count} markers of {best}"

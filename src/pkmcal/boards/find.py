@@ -23,8 +23,8 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.circles import LEAST_WINDOW_RADIUS, circle_centres, find_circles
-from pkmcal.boards.saddles import SADDLE_OPTIONS, is_large_enough, largest_block
-from pkmcal.levels import NEARLY_ALL
+from pkmcal.boards.saddles import image_noise, largest_block
+from pkmcal.levels import CONTRADICTION_SIGMAS, FEW, MAJORITY, NEARLY_ALL
 from pkmcal.observe.images import narrowed
 from pkmcal.solver.marquardt import Damping
 from pkmcal.solver.ranks import column_space
@@ -34,12 +34,9 @@ from pkmcal.solver.ranks import column_space
 class BoardDetectionOptions:
     """Constants of the detection of a board's corners and of their fit.
 
-    Of 18 simulated images of chessboards and ChArUco boards (640x480 px, tilts up to 55 degrees,
-    blur 0.5 to 3.5 px, fingers, shadows, noise 0.5 to 5 grey levels) 11 are detected, and of 6 with
-    windows, another chessboard or random squares none. Half and twice of ``blur_range``, of the
-    share that ``least_explained`` leaves, of ``whole_share`` (at most 0.875), ``visible_share``,
-    ``dark_border`` (at most 0.85), ``least_light`` and ``marker_contrast`` leave these numbers as
-    they are, and so does twice ``bend``; with half of it one image less is detected.
+    A corner is accepted if its fit has more pixels than unknowns, explains most of the
+    window's variance, and keeps the corner and its blur within the window; other limits count
+    corners or markers. The widths bound the cost of the search.
     """
 
     # most steps of a corner's fit
@@ -50,10 +47,15 @@ class BoardDetectionOptions:
     least_radius: float = LEAST_WINDOW_RADIUS
     # largest radius of a window, px: lines bend in a larger one
     most_radius: int = 14
-    # range of the blur, px; outside, the window shows something other than a corner
-    blur_range: tuple[float, float] = (0.25, 4.0)
-    # share of the window's variance that a corner explains; shadows and fingers leave less
+    # share of the window's variance that a corner explains; with 0.5, measured, some corners beside
+    # clutter are accepted that are wrong by pixels
     least_explained: float = 0.6
+    # share of the corners of a chessboard or of a grid of circles that must fit: these are detected
+    # as a whole, and what has less is something else
+    whole_share: float = MAJORITY
+    # share of the middles of 3 x 3 corners of a chessboard below which it is not searched; a corner
+    # in glare, or covered, costs up to nine
+    visible_share: float = FEW
     # longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur
     longest_step: tuple[float, ...] = (1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3)
     # squares around a corner that its fit uses, and by which it may move the corner: longer edges
@@ -66,29 +68,21 @@ class BoardDetectionOptions:
     # corners below which an image says nothing: four fix a board's pose, two more test it
     # (derived)
     least_corners: int = 6
-    # share of a chessboard's corners that must look like corners: what is found there is the whole
-    # board, or something else
-    whole_share: float = 0.75
     # width, px, from which images are tried at half their size as well
     half_size_from: int = 1000
     # width, px, to which larger images are reduced to search for a chessboard, and for outlines of
     # markers; one way takes ten
     # seconds on a cluttered image of twelve megapixels (measured)
     searched_width: int = 1600
-    # share of the corners inside a chessboard of which all neighbours must be seen; a corner in
-    # glare, or covered, costs up to nine
-    visible_share: float = 0.2
     # fewest markers visible of a ChArUco board, six corners of which lie between six, and of a grid
     least_charuco_markers: int = 4
     least_grid_markers: int = 2
-    # what may be a marker: the border's middle, as a share of the marker's side; its share that is
-    # dark; the least share inside that is light, and that is dark; grey levels between them
-    border_place: float = 0.055
-    dark_border: float = 0.7
-    least_light: float = 0.1
-    marker_contrast: float = 10.0
-    # share of a square by which a corner may lie off the middle of its two neighbours' line
-    bend: float = SADDLE_OPTIONS.bend
+    # what may be a marker: the middle of the narrowest border, half of one of nine modules, as a
+    # share of the marker's side; the least share of light and of dark bits in a marker of OpenCV's
+    # dictionaries, 2 of 16; and the contrast between them, in standard deviations of the noise
+    border_place: float = 1 / 18
+    least_bits: float = 1 / 8
+    marker_contrast: float = CONTRADICTION_SIGMAS
 
 
 BOARD_DETECTION_OPTIONS = BoardDetectionOptions()
@@ -242,8 +236,8 @@ def detect_markers(image: Integers, words: Any, quick: bool = False, border: int
 def marker_outlines(
     image: Integers, options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS
 ) -> Array:
-    """Outlines (k, 4, 2) px of what may be markers of any dictionary: quadrilaterals with a dark
-    border and with light and dark inside.
+    """Outlines (k, 4, 2) px of what may be markers of any dictionary: quadrilaterals with, inside,
+    areas as dark as the border and light ones.
 
     A detector compares each quadrilateral with all markers of its dictionary, which takes most of
     its time; photographs without a board have hundreds of quadrilaterals.
@@ -266,14 +260,13 @@ def marker_outlines(
     grey = image[row, column].astype(float)
     border, inside = grey[:, : 4 * len(side)], grey[:, 4 * len(side) :]
     dark = np.median(border, axis=1)
-    light = np.quantile(inside, 1 - options.least_light / 2, axis=1)
+    light = np.quantile(inside, 1 - options.least_bits / 2, axis=1)
     middle = (dark + light)[:, None] / 2
     share = np.mean(inside > middle, axis=1)
     marker_like = (
-        (light - dark > options.marker_contrast)
-        & (np.mean(border < middle, axis=1) >= options.dark_border)
-        & (share >= options.least_light)
-        & (share <= 1 - options.least_light)
+        (light - dark > options.marker_contrast * image_noise(image))
+        & (share >= options.least_bits)
+        & (share <= 1 - options.least_bits)
     )
     return outlines[marker_like]
 
@@ -334,11 +327,12 @@ def find_chessboard(
     """
     if block is None:
         block = largest_block(narrowed(image, options.searched_width)[0])
-    if not is_large_enough(block, counts, options.visible_share):
+    middles = (counts[0] - 2) * (counts[1] - 2)
+    if block < max(1.0, options.visible_share * middles):
         return None
     for pixels in _attempts(image, counts, quick, options):
         grid = pixels.reshape(counts[1], counts[0], 2)
-        if _is_grid(grid, options):
+        if _is_grid(grid):
             return _oriented(image, grid).reshape(-1, 2)
     return None
 
@@ -381,22 +375,17 @@ def _pictures(
     yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0 * scale
 
 
-def _is_grid(grid: Array, options: BoardDetectionOptions) -> bool:
-    """Corners in order: every one near the middle between its neighbours, no row crossing."""
-    for axis in (0, 1):
-        step = np.diff(grid, axis=axis)
-        length = np.linalg.norm(step, axis=-1)
-        bend = np.linalg.norm(np.diff(step, axis=axis), axis=-1)
-        near = np.minimum(*np.split(np.stack([
-            np.take(length, range(length.shape[axis] - 1), axis),
-            np.take(length, range(1, length.shape[axis]), axis),
-        ]), 2))[0]  # fmt: skip
-        if length.min() < 2 or np.any(bend > options.bend * 2 * near):
-            return False
-    right = grid[:-1, 1:] - grid[:-1, :-1]
-    down = grid[1:, :-1] - grid[:-1, :-1]
-    area = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
-    return bool(np.all(area > 0) or np.all(area < 0))
+def _is_grid(grid: Array) -> bool:
+    """Whether corners (rows, columns, 2) are in order: the images of squares are convex and all
+    have one orientation.
+    """
+    right, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
+    area = [
+        x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]
+        for x in (right[:-1], right[1:])
+        for y in (down[:, :-1], down[:, 1:])
+    ]
+    return bool(np.all(np.array(area) > 0) or np.all(np.array(area) < 0))
 
 
 def _oriented(image: Integers, grid: Array) -> Array:
@@ -820,13 +809,13 @@ def _judged(
     mean = np.sum(weight * grey, axis=1) / total
     variance = np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total
     remainder = np.sum(weight * fitted.residual**2, axis=1) / total
-    blur, shifted = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
+    # A wider blur shows no edge in the window, and a corner outside it is another one.
+    radius = np.clip(options.reach * scale, options.least_radius, options.most_radius)
     good = (
         (remainder < (1 - options.least_explained) * variance)
-        & (blur > options.blur_range[0] / 2)
-        & (blur < np.maximum(options.blur_range[1], 0.2 * scale))
-        & (shifted < np.maximum(1.5, options.reach * scale))
-        & (weight.sum(axis=1) > 12)
+        & (np.exp(p[:, 4]) < radius)
+        & (np.hypot(p[:, 0], p[:, 1]) < radius)
+        & (weight.sum(axis=1) > p.shape[1])
         & np.isfinite(p).all(axis=1)
     )
     # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.

@@ -1,65 +1,60 @@
 """Search for blocks of chessboard corners, whatever the board's counts.
 
 A corner of a chessboard is a saddle of the grey levels: on a ring around it, opposite pixels are
-equal and pixels a quarter turn apart differ. In a block of 3 x 3 corners, opposite neighbours are
-about as far away, and light and dark quadrants change places from one to the next. The search takes
-a tenth of a second; a detector of boards takes longer for each pair of counts.
+equal and pixels a quarter turn apart differ. A block of 3 x 3 corners is a lattice, and light and
+dark quadrants change places from one corner to the next.
+
+A block is accepted by its number of false alarms (Desolneux, Moisan, Morel: From Gestalt Theory to
+Image Analysis, 2008, chapter 3): the number of blocks tried, times the probability of one as
+regular among independent saddles, uniformly distributed in place and in the direction of their
+light quadrants. It bounds the expected number of blocks accepted in an image without regularity.
+The search takes a tenth of a second; a detector of boards takes longer for each pair of counts.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.levels import FALSE_ALARM
 
 RING = np.array([
     (3, 0), (3, 1), (2, 2), (1, 3), (0, 3), (-1, 3), (-2, 2), (-3, 1),
     (-3, 0), (-3, -1), (-2, -2), (-1, -3), (0, -3), (1, -3), (2, -2), (3, -1),
 ])  # fmt: skip
 """Pixels x, y of a circle of radius 3 px."""
+RING_NOISE = 0.156
+"""Standard deviation of each component of the second harmonic on the ring, per grey level of white
+noise in the image: the norm of the ring's weights convolved with the Gaussian."""
+LAPLACIAN = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+"""Difference of two Laplacians, to which grey levels that change quadratically contribute nothing;
+of white noise it has six times the standard deviation (Immerkaer, 1996)."""
+MEDIAN_NORMAL = 0.6745
+"""Median of the modulus of a normal number, in standard deviations."""
+LATTICE = np.array([(-1, 0), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)])
+"""Corners of a block that two steps from its middle predict, in these steps."""
+COLOURS = np.array([-1, -1, -1, -1, 1, 1, 1, 1])
+"""Sign of the second harmonic at the corners of a block, relative to its middle: at the ends of the
+two steps, then as in `LATTICE`."""
 
 
 @dataclass(frozen=True)
 class SaddleOptions:
-    """Constants of the search for blocks of chessboard corners.
-
-    None is critical within a factor of two (of the angle for cosines, of the logarithm for a ratio;
-    one for a count of diagonals), measured with each changed by itself on new images: 72 of
-    chessboards (12 of three seeds of rendered machines, 60 of random views by a pinhole camera and
-    a fisheye lens) and 72 without one (12 of these machines, 60 of random grids of windows). All
-    chessboards are large enough with all values but a ``growth`` of 0.3, which loses one; of images
-    without, two are, none with that growth, and four with a ``least_contrast`` of 3.
+    """Constants of the search for blocks of chessboard corners. All but the level bound its cost:
+    they determine which blocks are tried, not which are accepted.
     """
 
-    # least side of an image, px, of which the half is searched too: in a smaller one, windows of a
-    # facade alternate as squares do
+    # expected number of saddles by noise, and of blocks by chance, that are accepted in an image
+    false_alarms: float = FALSE_ALARM
+    # least side of an image, px, of which the half is searched too
     least_side: int = 300
-    # least difference between light and dark quadrants, grey levels
-    least_contrast: float = 6.0
     # most saddles of one image that are examined, those of the largest contrast first
-    most: int = 6000
-    # nearest saddles among which the neighbours of a corner are searched
+    most: int = 2000
+    # nearest saddles among which the ends of the two steps of a block are searched
     nearest: int = 12
-    # share of the nearer neighbour's distance by which two opposite ones may miss each other's
-    # reflection: at the border of a very wide lens, squares grow by a half from one to the next
-    growth: float = 0.6
-    # share of a square's side by which a corner may miss its place by its neighbours: that of the
-    # parallelogram of three others here, the middle between two in the whole board
-    bend: float = 0.35
-    # least cosine between the directions of light and dark quadrants of corners of a block
-    least_cosine: float = 0.5
-    # the same between these and the middle of the axes that its neighbours span
-    least_cosine_axes: float = 0.8
-    # least sine of the angle between the two sides of a square
-    least_sine: float = 0.2
-    # corners of the four diagonal ones that a block must have
-    least_diagonals: int = 3
-    # largest ratio of the contrasts of a corner and its neighbour
-    most_ratio: float = 3.0
 
 
 SADDLE_OPTIONS = SaddleOptions()
@@ -73,24 +68,32 @@ def largest_block(image: Integers, options: SaddleOptions = SADDLE_OPTIONS) -> i
     import cv2
 
     picture: Any = image
-    most = _largest_block(*saddles(picture, options), options)
+    scales = [saddles(picture, options)]
     while min(picture.shape) >= options.least_side:
         picture = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        most = max(most, _largest_block(*saddles(picture, options), options))
-    return most
+        scales.append(saddles(picture, options))
+    # blocks tried: every pair of neighbours of every saddle
+    tests = sum(len(places) for places, _ in scales) * options.nearest * (options.nearest - 1) / 2
+    return max(_largest_block(*scale, tests, options) for scale in scales)
 
 
-def is_large_enough(block: int, counts: tuple[int, int], share: float) -> bool:
-    """Whether a part of a chessboard, by :func:`largest_block`, can be a whole board of ``counts``
-    (columns, rows) of inner corners; share : of its inner corners that must be in the part.
+def image_noise(image: Integers) -> float:
+    """Standard deviation of the noise of an image, grey levels (height, width): at least that of
+    rounding, 1 / sqrt 12.
     """
-    return block >= max(1.0, share * (counts[0] - 2) * (counts[1] - 2))
+    import cv2
+
+    second: Any = cv2.filter2D(image, cv2.CV_32F, LAPLACIAN)
+    return max(float(np.median(np.abs(second))) / (6 * MEDIAN_NORMAL), 12**-0.5)
 
 
 def saddles(image: Integers, options: SaddleOptions = SADDLE_OPTIONS) -> tuple[Array, Array]:
     """Saddles of the grey levels: places (n, 2) px, and the second harmonic (n,) of the grey levels
     on a ring around each, complex: its modulus is the contrast, twice the direction of its light
     quadrants the phase.
+
+    The modulus exceeds that of noise: by Rayleigh's distribution, less than ``false_alarms`` of the
+    image's pixels are expected to.
     """
     import cv2
 
@@ -108,69 +111,65 @@ def saddles(image: Integers, options: SaddleOptions = SADDLE_OPTIONS) -> tuple[A
     half = np.abs(grey[:, :8] - grey[:, 8:]).sum(axis=1)
     harmonic = grey @ np.exp(2j * np.arctan2(RING[:, 1], RING[:, 0])) / 8
     contrast = np.abs(harmonic)
-    corner = (quarter > half) & (contrast > options.least_contrast)
-    chosen = np.flatnonzero(corner)
+    noise = RING_NOISE * image_noise(image) * np.sqrt(2 * np.log(image.size / options.false_alarms))
+    chosen = np.flatnonzero((quarter > half) & (contrast > noise))
     chosen = chosen[np.argsort(-contrast[chosen], kind="stable")[: options.most]]
     return np.stack([x, y], axis=-1)[chosen].astype(float), harmonic[chosen]
 
 
-def _largest_block(places: Array, harmonic: Array, options: SaddleOptions) -> int:
-    """Number of adjoining saddles that each are the middle of a block of 3 x 3 corners."""
+def _largest_block(places: Array, harmonic: Array, tests: float, options: SaddleOptions) -> int:
+    """Number of adjoining saddles that each are the middle of a block of 3 x 3 corners; tests :
+    number of blocks tried in the image.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    if len(places) < 9:
+    if len(places) <= options.nearest:
         return 0
     tree = KDTree(places)
-    nearest = tree.query(places, k=min(options.nearest + 1, len(places)))[1][:, 1:]
-    contrast = np.abs(harmonic)
-    phase = harmonic / contrast
-    ratio = np.abs(np.log(contrast[nearest] / contrast[:, None]))
-    opposite = np.real(phase[nearest] * phase[:, None].conj()) < -options.least_cosine
-    opposite &= ratio < np.log(options.most_ratio)
-    steps = places[nearest] - places[:, None]
-    length = np.linalg.norm(steps, axis=-1)
-    # Axes: pairs of neighbours on both sides.
-    first, second = np.triu_indices(nearest.shape[1], 1)
-    miss = np.linalg.norm(steps[:, first] + steps[:, second], axis=-1)
-    short = np.minimum(length[:, first], length[:, second])
-    axis = opposite[:, first] & opposite[:, second] & (miss <= options.growth * short)
-    neighbours: dict[int, Integers] = {}
-    for i in np.flatnonzero(axis.sum(axis=1) >= 2).tolist():
-        pairs = nearest[i][np.stack([first, second], axis=-1)[axis[i]]]
-        for a, b in combinations(pairs, 2):
-            ends = np.concatenate([a, b])
-            if _diagonals(i, ends, places, phase, tree, options) >= options.least_diagonals:
-                neighbours[i] = ends
-                break
-    joined = [(i, j) for i, ends in neighbours.items() for j in ends.tolist() if j in neighbours]
-    if not joined:
-        return min(len(neighbours), 1)
-    rows, columns = np.array(joined).T
+    distance, nearest = tree.query(places, k=options.nearest + 1)
+    # Blocks (k,): a saddle, and two neighbours of opposite colours as the ends of its two steps.
+    opposite = np.real(harmonic[nearest[:, 1:]] * harmonic[:, None].conj()) < 0
+    first, second = np.triu_indices(options.nearest, 1)
+    middle, pair = np.nonzero(opposite[:, first] & opposite[:, second])
+    ends = nearest[middle[:, None], 1 + np.stack([first, second], axis=-1)[pair]]
+    steps = places[ends] - places[middle, None]
+    # The saddles nearest to the places of the other six corners (k, 6), and their distances.
+    miss, others = tree.query(places[middle, None] + LATTICE @ steps)
+    corners = np.concatenate([ends, others], axis=1)
+    # Angles (k, 8) of the phases from that of the middle, and (k,) of the middle's own from that of
+    # the squares' diagonals, which lie between the steps; light and dark ones are not distinguished
+    angle = np.angle(harmonic[corners] * COLOURS * harmonic[middle, None].conj())
+    diagonal = np.prod(steps[..., 0] + 1j * steps[..., 1], axis=1)
+    own = np.abs(np.angle(harmonic[middle] * diagonal.conj()))
+    largest = np.maximum(np.abs(angle).max(axis=1), np.minimum(own, np.pi - own))
+    density = options.nearest / (np.pi * distance[middle, -1] ** 2)
+    chance = _chance(miss.max(axis=1), density, largest)
+    distinct = np.diff(np.sort(np.column_stack([middle, corners]), axis=1), axis=1).all(axis=1)
+    accepted = (tests * chance < options.false_alarms) & distinct
+    # The largest number of middles that neighbour each other.
+    middle, sides = middle[accepted], corners[accepted, :4]
+    joined = np.isin(sides, middle)
+    rows, columns = np.repeat(middle, 4)[joined.ravel()], sides[joined]
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(places),) * 2)
-    return int(np.bincount(connected_components(graph, directed=False)[1]).max())
+    part = connected_components(graph, directed=False)[1][np.unique(middle)]
+    return int(np.bincount(part, minlength=1).max())
 
 
-def _diagonals(
-    i: int, ends: Integers, places: Array, phase: Array, tree: Any, options: SaddleOptions
-) -> int:
-    """Number of diagonal corners beside a saddle; ends : (4,), its neighbours on both sides along
-    one axis, then along the other.
+def _chance(miss: Array, density: Array, angle: Array) -> Array:
+    """Probability (k,) that independent saddles form a block as regular.
+
+    miss : (k,) px, largest distance of six corners from their places. density : (k,) saddles per
+        square pixel. angle : (k,) rad, largest angle of nine phases from theirs.
+
+    A uniformly distributed saddle lies within a distance with at most the expected number of
+    saddles there, and its phase within an angle with angle / pi; that of the middle, of either
+    sign, with twice that. Of the product p of two independent probabilities, one at most as small
+    has the probability p (1 - ln p) (Fisher).
     """
-    a, minus_a, b, minus_b = ends
-    pairs = np.array([(a, b), (a, minus_b), (minus_a, b), (minus_a, minus_b)])
-    sides = places[pairs] - places[i]
-    lengths = np.linalg.norm(sides, axis=-1)
-    area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
-    # Light quadrants lie between the edges, which run along the axes.
-    x, y = (places[[a, b]] - places[[minus_a, minus_b]]).T
-    along = np.prod(x + 1j * y)
-    if abs(np.real(phase[i] * np.conj(along))) < options.least_cosine_axes * abs(along):
-        return 0
-    # Two axes that are almost one span no square.
-    if np.any(area < options.least_sine * lengths.prod(axis=1)):
-        return 0
-    distance, corner = tree.query(places[i] + sides.sum(axis=1))
-    parallel = np.real(phase[corner] * np.conj(phase[i])) > options.least_cosine
-    return int(np.sum((distance <= options.bend * lengths.min(axis=1)) & parallel))
+    # a disc of whole pixels: a distance of 0 is that of one pixel
+    expected = density * np.pi * (miss + np.pi**-0.5) ** 2
+    product = np.minimum(expected, 1.0) ** len(LATTICE)
+    product = product * np.minimum(2 * (angle / np.pi) ** (len(COLOURS) + 1), 1.0)
+    return product * (1 - np.log(product))
