@@ -29,7 +29,7 @@ HINGED = ("h4-rods",)
 """Machines that cannot be simulated: how far their side bars turn is not known."""
 COMMANDS = ("calibrate", "holdout", "validate", "watch")
 CONFIGURATIONS, LEFT_OUT = 24, 5
-"""Configurations of a session; held out, validated with, and watched with."""
+"""Configurations to calibrate from; of each, besides: held out, validated with, watched with."""
 STATIONS = {"legs": (2, (640, 480)), "board": (1, (1280, 960))}
 """Stations of a kind of image, and the images' size."""
 NOISE = 1e-5
@@ -92,8 +92,9 @@ def answers(machine: str, kind: str, seed: int) -> dict[str, Answer]:
         folder, out = Path(temporary) / "session", Path(temporary) / "result"
         observed = {"board": True, "on_platform": True, "observe": ("board",)}
         pkmcal.simulate(
-            folder, machine, camera=size, stations=stations, configurations=CONFIGURATIONS,
-            shared=True, joint_noise=NOISE, seed=seed, **(observed if kind == "board" else {}),
+            folder, machine, camera=size, stations=stations,
+            configurations=CONFIGURATIONS + 3 * LEFT_OUT, shared=True, joint_noise=NOISE,
+            seed=seed, **(observed if kind == "board" else {}),
         )  # fmt: skip
         truth = load_truth(folder)
         true = Session(folder, truth.machine, truth.T_base_platform, truth.joints)
