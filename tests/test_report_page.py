@@ -363,6 +363,15 @@ ACTED = """
   out.opened = $("#how details").open && $("#how dl") !== null;
   rows()[0].dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
   out.selected = document.querySelectorAll("#parameters tr.hovered").length;
+  const levels = ["good", "note", "doubtful", "wrong"];
+  const frames = levels.flatMap((level) => ["sign", "limit"].map((name) => {
+    const one = document.createElement("span");
+    one.className = `${name} ${level}`;
+    $(".card").append(one);
+    const style = getComputedStyle(one);
+    return `${style.padding} ${style.borderWidth}`;
+  }));
+  out.frames = [...new Set(frames)].join("; ");
 """
 
 
@@ -388,6 +397,7 @@ def test_page_works_in_a_browser(page, tmp_path, width, dark):
     assert root["yaml"].count("- ") == len(free)
     assert root["opened"] == "true"
     assert int(root["selected"]) > 1  # all rows of the leg
+    assert root["frames"] == "0px 0px"  # signs and limits of all levels have none
     assert root["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(244, 245, 247)")
 
 

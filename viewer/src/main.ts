@@ -17,7 +17,7 @@ function start(): void {
   const content = JSON.parse(source.textContent ?? "") as ViewerDocument;
   host.replaceChildren();
   if (content.version !== VERSION) {
-    host.append(h("p", { class: "note" }, "This page was written by another version of pkmcal."));
+    host.append(h("p", { class: "box" }, "This page was written by another version of pkmcal."));
     return;
   }
   switch (content.kind) {

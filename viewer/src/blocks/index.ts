@@ -44,6 +44,6 @@ export function drawBlock(block: Block, context: Context): HTMLElement {
     return draw(block, context);
   } catch (error) {
     console.error(error); // the other blocks of the page are drawn all the same
-    return h("p", { class: "note" }, "This part of the page cannot be drawn.");
+    return h("p", { class: "box" }, "This part of the page cannot be drawn.");
   }
 }

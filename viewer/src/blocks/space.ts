@@ -32,7 +32,7 @@ export function space(block: Space, context: Links): HTMLElement {
       true,
     );
   } catch {
-    figure.append(h("p", { class: "note" }, `${NO_WEBGL} The tables of this page are complete.`), h("figcaption", { class: "small" }, block.caption));
+    figure.append(h("p", { class: "box" }, `${NO_WEBGL} The tables of this page are complete.`), h("figcaption", { class: "small" }, block.caption));
     return figure;
   }
   const model = new SpaceModel(block, stage);

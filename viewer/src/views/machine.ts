@@ -29,7 +29,7 @@ export function machineView(host: HTMLElement, content: MachineDocument): void {
     model = new MachineModel(machine, stage);
   } catch (error) {
     if (stage) throw error;
-    place.append(h("p", { class: "note" },
+    place.append(h("p", { class: "box" },
       `${NO_WEBGL} The readings, the platform's position and the legs' values beside are complete.`));
   }
 

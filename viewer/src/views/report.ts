@@ -63,17 +63,17 @@ const items = (texts: readonly string[]): HTMLElement[] => texts.map((text) => h
 function findingsOf(content: ReportDocument): HTMLElement[] {
   const lists: HTMLElement[] = [];
   const add = (heading: string, kind: string, texts: readonly string[]): void => {
-    if (texts.length) lists.push(h("div", { class: `note ${kind}` }, h("h3", {}, heading), h("ul", {}, ...items(texts))));
+    if (texts.length) lists.push(h("div", { class: `box ${kind}` }, h("h3", {}, heading), h("ul", {}, ...items(texts))));
   };
   add("Look at this", "warn", content.warnings);
   add("What would help", "", content.advice);
   if (content.remarks.length) {
     const count = content.remarks.length === 1 ? "1 remark" : `${content.remarks.length} remarks`;
-    lists.push(h("details", { class: "note" }, h("summary", {}, `${count} without effect on the result`),
+    lists.push(h("details", { class: "box" }, h("summary", {}, `${count} without effect on the result`),
       h("ul", {}, ...items(content.remarks))));
   }
   const own = content.notes
-    ? [h("section", { class: "note own", "aria-label": "Notes" }, h("h3", {}, "Notes"), h("p", {}, content.notes))]
+    ? [h("section", { class: "box own", "aria-label": "Notes" }, h("h3", {}, "Notes"), h("p", {}, content.notes))]
     : [];
   return [...own, ...(lists.length ? [h("section", { class: "notes", "aria-label": "Findings" }, ...lists)] : [])];
 }
