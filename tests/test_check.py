@@ -11,8 +11,8 @@ import pytest
 from conftest import run
 from pkmcal.calibration.leg_numbering import equal_numberings, numbering_note
 from pkmcal.checks.check import BROKEN_IMAGES_NAMED, _kinematics, check_session
-from pkmcal.checks.results import JointCheck, StationCheck
-from pkmcal.checks.sentences import joint_findings, station_findings
+from pkmcal.checks.results import JointCheck, SessionCheck, StationCheck
+from pkmcal.checks.sentences import joint_findings, outcome_of, station_findings
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
@@ -161,6 +161,15 @@ def test_readings_that_the_nominal_model_cannot_take(session, x, where, message)
 
 
 # single judgements
+
+
+@pytest.mark.parametrize(("handheld", "counted"), [(False, "stations"), (True, "images")])
+def test_a_cards_unit_is_what_was_searched(handheld, counted):
+    """Of hand-held images each is a station of its own, which no user calls so."""
+    station = replace(GOOD, by_chance=1e-6, handheld=handheld)
+    searched = (station, replace(station, recognised=False))
+    check = SessionCheck("session", (), "3-rps", 3, 15, searched)
+    assert outcome_of(check).figures[0].values == (("1 of 2", counted),)
 
 
 @pytest.mark.parametrize(

@@ -411,6 +411,7 @@ def _station_check(station: Station, what: Quality, recognised: bool) -> Station
         name=station.name,
         photographs=len(station.images),
         recognised=recognised,
+        handheld=station.handheld,
         legs=float(what.legs.sum(axis=1).mean()) if some else 0.0,
         saturated=float(what.saturated.mean()) if some else math.nan,
         black=float(what.black.mean()) if some else math.nan,

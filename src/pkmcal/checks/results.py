@@ -59,12 +59,14 @@ class StationCheck:
     """Check of one station.
 
     mismatch : 0 for a perfect match, 1 for none; NaN without a search.
-    by_chance : probability that wrong readings match as well; NaN without a search.
+    by_chance : probability that wrong readings (by hand: another place) match as well; NaN without
+        a search.
     moved, turned : distance (m) and rotation (rad) from the rough to the localized pose.
     legs : mean number of legs measured in an image.
     saturated, black : mean shares of the legs' pixels.
     blur : median, px.
     board : None if the station observes none, or it was not detected.
+    handheld : whether it is an image by hand, with a pose of its own.
     """
 
     name: str
@@ -78,6 +80,7 @@ class StationCheck:
     black: float = math.nan
     blur: float = math.nan
     board: BoardCheck | None = None
+    handheld: bool = False
     by_chance: float = math.nan
 
 

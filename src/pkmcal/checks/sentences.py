@@ -224,12 +224,14 @@ def _cards(check: SessionCheck) -> tuple[Figure, ...]:
     if searched:
         good = sum(one.recognised for one in searched)
         worst = max(searched, key=lambda one: one.by_chance)
+        by_hand = all(one.handheld for one in searched)
         out.append(
             Figure(
                 "Where is the machine recognized?",
-                ((f"{good} of {len(searched)}", "stations"),),
-                "wrong readings would match as well with a probability of"
-                f" {Chance(worst.by_chance)} at worst ({worst.name})",
+                ((f"{good} of {len(searched)}", "images" if by_hand else "stations"),),
+                ("another place" if worst.handheld else "wrong readings")
+                + f" would match as well with a probability of {Chance(worst.by_chance)} at worst"
+                f" ({worst.name})",
                 mark="good" if good == len(searched) else Level.WRONG,
             )
         )
