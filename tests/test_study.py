@@ -142,8 +142,8 @@ def test_a_machine_of_another_size_is_the_same_machine(name):
 ANOTHER_VALUE = {
     "resolution": 800, "focal": 900, "distance": 1.7, "elevation": 35, "stations": 2,
     "configurations": 3, "edge_noise": 0.2, "corner_noise": 0.1, "shading": 0.1,
-    "reading_noise": 1e-5, "radius": 1.2, "size": 1.1, "tolerance": 0.5, "extreme": 1,
-    "observe": "legs+board", "camera": "mirror",
+    "reading_noise": 1e-5, "reading_resolution": 1e-3, "play": 1e-4, "radius": 1.2, "size": 1.1,
+    "tolerance": 0.5, "extreme": 1, "observe": "legs+board", "camera": "mirror",
 }  # fmt: skip
 """Value of each name other than that of the usual design."""
 
@@ -162,6 +162,20 @@ def drawn(vary):
     data = setting.draw(batch_of(setting, runs=1))
     problem = data.assembled.problem
     return plainly([data.theta, data.poses, problem.data, problem.pose_data])
+
+
+def test_readings_have_play_and_steps():
+    """Their scatter about the drives' positions is what a session states."""
+    design = design_of("3-rpr", "reading_noise=2e-5", "reading_resolution=1e-4", "play=6e-5")
+    rng = np.random.default_rng(3)
+    joints = rng.uniform(0.1, 0.4, (50, 200, 3))
+    readings = design.readings(joints, rng)
+    steps = readings / 1e-4
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    assert np.std(readings - joints) == pytest.approx(design.reading_sigma, rel=0.02)
+    risen = joints > np.roll(joints, 1, axis=1)
+    ahead = [(readings - joints)[side].mean() for side in (risen, ~risen)]
+    np.testing.assert_allclose(ahead, [3e-5, -3e-5], atol=2e-6)
 
 
 def test_cameras_change_as_stated():
@@ -265,6 +279,7 @@ def test_the_tool_of_the_truth_is_not_off():
     ("subject", "vary"),
     [
         ("3-rpr", ["stations=1", "configurations=10"]),
+        ("3-rpr", ["configurations=10", "reading_resolution=3e-4", "play=3e-4"]),
         pytest.param("h4", ["observe=board", "stations=1", "configurations=12"],
                      marks=pytest.mark.slow),  # boards are in the row after the next, too
         ("gough-stewart", ["camera=mirror", "stations=1", "configurations=10"]),
@@ -289,6 +304,7 @@ def test_stated_deviations_hold(subject, vary, one_process):
     ("subject", "vary"),
     [
         ("3-rpr", ["stations=1", "configurations=20"]),
+        ("3-rpr", ["configurations=20", "reading_resolution=3e-4", "play=3e-4"]),
         ("h4", ["observe=board", "stations=1", "configurations=20"]),
         ("gough-stewart", ["camera=mirror", "stations=1", "configurations=20"]),
         ("gough-stewart", ["stations=3", "configurations=15"]),

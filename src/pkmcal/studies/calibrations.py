@@ -140,9 +140,8 @@ class SimulatedCalibrations:
         capture = captured(design, batch.generator(IMAGE_PLAN_STREAM))
         theta, true = _machines(design, capture, batch.runs, rng)
         poses, internal = true.T_base_platform, true.internal
-        noise = rng.standard_normal((batch.runs, *capture.joints.shape))
-        readings = true.readings + design.reading_noise * noise
-        template = assemble(capture.machine, capture.measurements(design.reading_noise), self.gauge)
+        readings = design.readings(true.readings, rng)
+        template = assemble(capture.machine, capture.measurements(design.reading_sigma), self.gauge)
         problem = template.problem
         data = replace(problem.data, joints=readings[:, template.observed])
         if len(capture.edges):
@@ -422,7 +421,7 @@ def _measured_edges(
         by_tilt[:, own] = tilt.reshape(runs, -1, 2)
     # Errors in px: independent noise, the camera's edge shift, and the shading of the tube's side.
     error = design.edge_noise * rng.standard_normal((2, runs, n))
-    measured = capture.measurements(design.reading_noise)
+    measured = capture.measurements(design.reading_sigma)
     camera = np.asarray(measured.camera_of_station)[edges.station]
     outward = SHIFT_SIGMA * rng.standard_normal((runs, measured.n_cameras))[:, camera]
     line = lines(measured)[1]

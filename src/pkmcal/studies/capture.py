@@ -9,6 +9,7 @@ machine's shorter leg still has its planned length.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -60,7 +61,10 @@ class Design:
     configurations : number for each station.
     shared : whether all stations observe the same configurations.
     distance, elevation : of the cameras; None for the defaults.
-    reading_noise : standard deviation, m or rad.
+    reading_noise : standard deviation of a drive's position at a reading, m or rad.
+    reading_resolution : step of the readings, m or rad; 0 for none.
+    play : of the drives, m or rad: the difference of a drive's positions at one reading, reached
+        from a larger and from a smaller one.
     edge_noise : standard deviation of an edge's shift, and of its ends by tilt, px.
     corner_noise : standard deviation of a coordinate of a corner, px.
     shading : standard deviation of the common shift of all edges of a tube's side at a station, px.
@@ -79,6 +83,8 @@ class Design:
     distance: float | None = None
     elevation: float | None = None
     reading_noise: float = 3e-6
+    reading_resolution: float = 0.0
+    play: float = 0.0
     edge_noise: float = 0.1
     corner_noise: float = 0.05
     shading: float = 0.03
@@ -91,6 +97,26 @@ class Design:
         none.
         """
         return with_forearms(self.machine) if "legs" in self.observe else self.machine
+
+    @property
+    def reading_sigma(self) -> float:
+        """Standard deviation of a reading that a session states, m or rad: of noise, of a step that
+        is uniformly distributed, and of half of the play to either side.
+        """
+        return math.hypot(self.reading_noise, self.reading_resolution / 12**0.5, self.play / 2)
+
+    def readings(self, joints: Array, rng: np.random.Generator) -> Array:
+        """Readings of drives that are at ``joints`` (..., K, m), in their order.
+
+        A drive that comes from a smaller value stops half of the play short of its reading; the
+        first configuration follows the last.
+        """
+        came = np.sign(joints - np.roll(joints, 1, axis=-2))
+        noise = self.reading_noise * rng.standard_normal(joints.shape)
+        value = joints + noise + self.play / 2 * came
+        if not self.reading_resolution:
+            return value
+        return self.reading_resolution * np.round(value / self.reading_resolution)
 
     @property
     def camera_of_station(self) -> tuple[Camera, ...]:

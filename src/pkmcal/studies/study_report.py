@@ -66,7 +66,7 @@ STUDY_METHOD_TEXT = (
     "The tool's error is that of the platform's pose at readings spread over the workspace,"
     " between the calibrated and the true machine, frames laid over each other. What a camera"
     " sees is decided by the nominal model. Not simulated are wrong edges, other things in the"
-    " picture, bending, play and errors of the lens: these reduce the accuracy by an"
+    " picture, bending and errors of the lens: these reduce the accuracy by an"
     " amount that no simulation gives.",
 )
 PAPER_STUDY_METHOD_TEXT = (

@@ -40,6 +40,8 @@ DESIGN_NAMES_VARIED: Mapping[str, Varied] = {
     "corner_noise": Varied("sigma of a board's corner", "px", 1e-4, 100),
     "shading": Varied("sigma of an edge's shift by shading", "px", 0, 100),
     "reading_noise": Varied("sigma of a joint reading", "m or rad", 1e-12, 1),
+    "reading_resolution": Varied("step of the joint readings", "m or rad", 0, 1),
+    "play": Varied("play of the drives", "m or rad", 0, 1),
     "radius": Varied("radii of the tubes, times the nominal model's", "", 0.01, 100),
     "size": Varied("size of the machine, times the nominal model's", "", 0.001, 1000),
     "tolerance": Varied("standard deviation of true machines, in prior sigmas", "", 0, 100),
