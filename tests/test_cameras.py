@@ -516,7 +516,11 @@ def test_the_parameters_of_a_file_stand_in_their_order(tmp_path):
         (
             "model: pinhole\n",
             "",
-            {"where": "a.yaml, model"},
+            {
+                "where": "a.yaml, model",
+                "expected": "double_sphere or extended_unified or fisheye or pinhole or rational "
+                "or unified",
+            },
         ),
         (
             "model: pinhole",

@@ -633,7 +633,7 @@ WRONG_PRINTERS = {
     changed(CFG, "delta_radius: 105.0", ""): "this value of the printer is missing: delta_radius",
     changed(CFG, "arm_length: 270.0", "arm_length: long"): "arm_length is no number",
     changed(CFG, "delta_radius: 105.0", "delta_radius: 300"): "longer than the delta radius",
-    changed(CFG, "angle: 330.0", "angle: 220"): "two towers stand in nearly one direction",
+    changed(CFG, "angle: 330.0", "angle: 220"): "two towers are less than 60 degrees apart",
     changed(CFG, "height0_pos = ", "height0_pos = 1e8,1e8,1e8 #"): "far below the bed",
     changed(CFG, "microsteps: 16", "microsteps: 16\ngear_ratio: 3"): "the gears cannot be read",
     changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not give",
@@ -654,6 +654,26 @@ def test_a_printers_file_with_too_little_in_it(text, tmp_path):
     assert done.code == 2
     assert WRONG_PRINTERS[text] in " ".join(done.err.split())
     assert not (tmp_path / "kit").exists()
+
+
+@pytest.mark.parametrize(
+    ("angles", "apart"),
+    [
+        ((0.0, 90.0, 170.0), True),  # all on one side of the bed
+        ((210.0, 250.0, 330.0), False),
+        ((0.0, 10.0, 185.0), False),
+        ((350.0, 10.0, 185.0), False),
+    ],
+)
+def test_towers_of_a_printer_are_apart(angles, apart, tmp_path):
+    """A delta is singular where two of its towers coincide."""
+    text = printers.printer_cfg(replace(SAYS, angle=angles), np.tile(SAYS.homed - 200, (7, 1)))
+    path = text_file(tmp_path, text, "printer.cfg")
+    if apart:
+        np.testing.assert_array_equal(read_printer(path).angle, angles)
+        return
+    with raises(InputError, found=", ".join(f"{a:g}" for a in angles) + " degrees"):
+        read_printer(path)
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "1e9", "0:1"])

@@ -353,7 +353,7 @@ def test_carriers_broadcast(side, carrier):
         (
             "motion: planar\n",
             "motion: planar\nmotion: spatial\n",
-            {"where": "m.yaml, line 3, motion"},
+            {"where": "m.yaml, line 3, motion", "code": "file.key_twice"},
         ),
         (
             "name: small\nmotion: planar",

@@ -95,7 +95,7 @@ def test_a_machine_in_millimetres_and_degrees_is_the_same_machine(name, tmp_path
             {
                 "where": "m.yaml, line 16, legs[1].tubes[1].radius",
                 "found": "'3 kg'",
-                "expected": "metres, or a unit, such as 269.3 mm",
+                "expected": "metres, or a number with its unit, such as 269.3 mm",
             },
         ),
         (
@@ -103,7 +103,7 @@ def test_a_machine_in_millimetres_and_degrees_is_the_same_machine(name, tmp_path
             {
                 "where": "m.yaml, line 16, legs[1].tubes[1].radius",
                 "found": "'3 deg'",
-                "expected": "metres, or a unit, such as 269.3 mm",
+                "expected": "metres, or a number with its unit, such as 269.3 mm",
             },
         ),
         (
@@ -111,7 +111,7 @@ def test_a_machine_in_millimetres_and_degrees_is_the_same_machine(name, tmp_path
             {
                 "where": "m.yaml, line 16, legs[1].tubes[1].radius",
                 "found": "'3 dB'",
-                "expected": "metres, or a unit, such as 269.3 mm",
+                "expected": "metres, or a number with its unit, such as 269.3 mm",
             },
         ),
         (
@@ -119,7 +119,7 @@ def test_a_machine_in_millimetres_and_degrees_is_the_same_machine(name, tmp_path
             {
                 "where": "m.yaml, line 16, legs[1].tubes[1].radius",
                 "found": "'3 mmm'",
-                "expected": "metres, or a unit, such as 269.3 mm",
+                "expected": "metres, or a number with its unit, such as 269.3 mm",
             },
         ),
         (

@@ -16,12 +16,15 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.hand_eye import LEAST_PAIR_CONFIGURATIONS
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.session.load import SESSION_FILE_NAME, Session
 from pkmcal.session.readings import same_pose
 from pkmcal.wording import count, listed
+
+FEWEST_TO_CALIBRATE = 3
+"""Fewest configurations from which a calibration is meaningful. Whether it is, its own verdict
+decides; not checked with other numbers."""
 
 MOST_CLUSTERING_ROUNDS = 100
 """Upper bound of the k-means iterations."""
@@ -210,17 +213,17 @@ def _check(n: int, remainder: int, total: int, what: str) -> None:
     """
     if (
         n >= 1
-        and remainder >= max(LEAST_PAIR_CONFIGURATIONS, total // 2)
+        and remainder >= max(FEWEST_TO_CALIBRATE, total // 2)
         and not (what == "regions" and n < 2)
     ):
         return
     least = 2 if what == "regions" else 1
-    most = total if what == "regions" else total - max(LEAST_PAIR_CONFIGURATIONS, total // 2)
+    most = total if what == "regions" else total - max(FEWEST_TO_CALIBRATE, total // 2)
     if most < least:
         raise InputError(
             "there are too few configurations to hold any out",
             found=f"{count(total, 'pose')} seen",
-            expected=f"{2 * LEAST_PAIR_CONFIGURATIONS} at least; configurations whose readings"
+            expected=f"{2 * FEWEST_TO_CALIBRATE} at least; configurations whose readings"
             " are equal within their noise are of one pose",
             next_step="Take images of more configurations",
         )

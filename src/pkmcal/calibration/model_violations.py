@@ -36,7 +36,6 @@ from pkmcal.identify.score import (
     ScoreTests,
 )
 from pkmcal.identify.tool import ToolAccuracy, tool_error
-from pkmcal.levels import MAJORITY
 from pkmcal.measurements import BOARD_MOUNT_NAME, Column, Measurements, Observation
 from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms import machine_from_document
@@ -50,9 +49,9 @@ from pkmcal.session.load import Session
 
 Family = Callable[[Session, Observation, Measurements, Estimate], Iterable[Column]]
 """Columns of model violations that share a part of the false-alarm level."""
-MOST_TOOL_SHIFT = (MAJORITY / (1 - MAJORITY)) ** 0.5
-"""Shift of the tool by a violation, in standard deviations, above which the result is refused: 1,
-beyond which the violation makes most of the tool's mean squared error."""
+MOST_TOOL_SHIFT = 1.0
+"""Shift of the tool by a violation, in standard deviations, above which the result is refused: the
+violation then makes most of the tool's mean squared error."""
 
 
 @dataclass(frozen=True)

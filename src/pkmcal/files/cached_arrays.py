@@ -28,14 +28,12 @@ MOST_CACHED_BYTES = 2**28
 _ENDING = ".npz"
 
 
-def digest_of(*parts: Any, packages: Mapping[str, str] | None = None) -> str:
+def digest_of(*parts: Any) -> str:
     """Digest of arrays and plain data, of the program's source, and of the versions of packages,
     for the name of a result that depends on nothing else.
-
-    packages : versions by name; by default those in use (:func:`pkmcal.files.versions`).
     """
     digest = blake2b(_source_digest(), digest_size=16)
-    digest.update(json_text(versions() if packages is None else packages).encode())
+    digest.update(json_text(versions()).encode())
     for part in parts:
         if isinstance(part, np.ndarray):
             digest.update(f"{part.dtype.str} {part.shape} ".encode())

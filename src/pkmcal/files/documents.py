@@ -442,6 +442,7 @@ class _Builder:
                     f"the key {key} occurs twice, on lines {names_so_far[key]} and {line}",
                     where=f"{self.label}, line {line}, {field_path((*keys, key))}",
                     next_step="Remove one of the two",
+                    code="file.key_twice",
                 )
             names_so_far[key] = line
         pairs = self._pairs(node)

@@ -92,7 +92,7 @@ def split_head(head: str) -> tuple[str, Unit | None]:
 def no_such(kind: str, value: object) -> FieldError:
     """Error for a value whose unit is of another kind."""
     what, plain, example = _KINDS[kind]
-    expected = f"{plain}, or a unit, such as {example}"
+    expected = f"{plain}, or a number with its unit, such as {example}"
     return FieldError(f"this is not {what}", found=quoted(value), expected=expected)
 
 

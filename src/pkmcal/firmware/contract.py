@@ -385,12 +385,13 @@ def buildable_delta(printer: Printer) -> Printer:
             found=f"rods of {printer.rod.min():g} mm, a radius of {printer.radius:g} mm",
             expected="both in mm, as the firmware has them",
         )
-    # towers all on one side of the bed's middle, which is outside of their triangle
+    # towers closer than half of their regular spacing: a delta is singular where two coincide, and
+    # works with all three on one side of the bed. Not checked with other spacings
     apart = np.sort(np.mod(printer.angle, 360))
     gaps = np.diff(np.append(apart, apart[0] + 360))
-    if gaps.max() >= 180:
+    if gaps.min() < 60:
         raise InputError(
-            "two towers stand in nearly one direction",
+            "two towers are less than 60 degrees apart",
             where=printer.label,
             found=", ".join(f"{a:g}" for a in printer.angle) + " degrees",
             expected="three directions about 120 degrees apart",

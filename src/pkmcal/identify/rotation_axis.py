@@ -43,8 +43,8 @@ class RotationAxis:
     hypothesis : rotations that the machine's motion allows.
     tilt : (N,) rad, deviation of each pose from the hypothesis.
     expected_tilt : (N,) RMS deviation due to noise alone.
-    spread, expected_spread : rad, RMS angle between the axes of pairs of poses and their mean, and
-        its value due to noise alone; NaN without pairs that turn.
+    spread, expected_spread : rad, weighted RMS angle between the axes of pairs of poses and their
+        mean, and its value due to noise alone; NaN without pairs that turn.
     chi2, dof, p_value : of the hypothesis; dof 0 and p_value 1 if there is nothing to test.
     """
 
@@ -190,7 +190,8 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     """RMS scatter (rad) of the axes of rotation between two poses, and its value from noise alone.
 
     In the camera frame. A rotation phi with noise n of its two poses moves the axis by n / (2
-    sin(phi / 2)) across. Pairs that noise alone may have turned have no axis.
+    sin(phi / 2)) across, and each axis has the weight of the inverse of its variance by noise.
+    Pairs that noise alone may have turned have no axis.
     """
     from scipy.special import chdtri
 
@@ -203,22 +204,23 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     if used.sum() < 2:
         return np.nan, np.nan
     i, j, turn, angle = i[used], j[used], turn[used], angle[used]
-    # mean axis, with a common sign
+    # variance of each axis from the noise of its two poses
     axis = turn / angle[:, None]
-    main = np.linalg.eigh(axis.T @ axis)[1][:, -1]
-    axis = axis * np.where(axis @ main < 0, -1.0, 1.0)[:, None]
-    mean = axis.sum(axis=0)
-    mean = mean / np.linalg.norm(mean)
-    apart = np.linalg.norm(skew(mean) @ axis[..., None], axis=(-1, -2))
-    # covariance of each axis from the noise of its two poses
     by = turn_jacobian(turn)  # by the later pose; the earlier pose's is its other half
     across = (np.eye(3) - axis[:, :, None] * axis[:, None, :]) @ by / angle[:, None, None]
     back = across @ rot[j] @ rot[i].mT
     covariance = across @ noise[j] @ across.mT
     covariance = covariance + back @ noise[i] @ back.mT
-    expected = np.sqrt(np.mean(np.trace(covariance, axis1=-2, axis2=-1)))
-    values = np.sqrt(np.mean(np.arctan2(apart, dot(axis, mean)) ** 2))
-    return float(values), float(expected)
+    weight = 1 / np.trace(covariance, axis1=-2, axis2=-1)
+    # mean axis, with a common sign
+    main = np.linalg.eigh((weight[:, None] * axis).T @ axis)[1][:, -1]
+    axis = axis * np.where(axis @ main < 0, -1.0, 1.0)[:, None]
+    mean = weight @ axis
+    mean = mean / np.linalg.norm(mean)
+    apart = np.linalg.norm(skew(mean) @ axis[..., None], axis=(-1, -2))
+    square = np.arctan2(apart, dot(axis, mean)) ** 2
+    value, expected = np.sqrt([weight @ square / weight.sum(), len(weight) / weight.sum()])
+    return float(value), float(expected)
 
 
 def _pairs(n: int) -> tuple[Integers, Integers]:

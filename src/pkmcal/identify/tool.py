@@ -18,7 +18,7 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, pose_generators, respecting_motion
-from pkmcal.levels import MAJORITY, ROUNDING
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold
@@ -42,8 +42,8 @@ class PoseSamplingOptions:
     # smallest distance of a sample from singular poses, relative to the median over the session:
     # near a singular pose any error is amplified, and no machine works there. Readings determine
     # the worst motion of a sample with at least half of the information that they have in the
-    # session's poses; information grows as the square of that distance
-    regular: float = MAJORITY**0.5
+    # session's poses. It affects the stated tool errors only; not checked within a factor of two
+    regular: float = 0.7
 
 
 _SAMPLING = PoseSamplingOptions()

@@ -56,11 +56,13 @@ class VerdictOptions:
 
     # noise scale above which the model does not explain the measurements
     too_noisy: float = UNEXPLAINED_SCALE
-    # share of rejected edges beyond which the noise of the others is not known: 0.37. The search
-    # begins with the noise by the median of the norms of pairs of residuals. With a share e of
+    # share of rejected measurements beyond which the noise of the others is not known: 0.37. The
+    # search begins with the noise by the median of the norms of residuals. With a share e of
     # outliers, however far away, that is the quantile q = 1 / (2 (1 - e)) of the others (the
     # median's maximum bias: P. J. Huber, Robust Statistics, 1981), which relative to their median
-    # is the root of -log2(1 - q) for the norm of two normal errors: NOISE_EXCESS here
+    # is the root of -log2(1 - q) for the norm of the two normal errors of an edge: NOISE_EXCESS
+    # here. All kinds have this limit of edges; by the same quantile it would be 0.27 for a distance
+    # (one number), 0.41 for three numbers, and 0.47 for a board's pose (six)
     too_many_rejected: float = 1 - MAJORITY / (1 - 2 ** -(NOISE_EXCESS**2))
     # limit of the undetermined part of the platform's error by the nominal model. A calibration
     # reduces that error by a factor of twenty to fifty; an undetermined twentieth would be the

@@ -42,7 +42,7 @@ def _check_increasing(value: tuple[float, float]) -> tuple[float, float]:
     """Validate a range of lengths."""
     if not 0 < value[0] < value[1]:
         raise FieldError(
-            "the range is not increasing",
+            "this is no range of lengths",
             found=list(value),
             expected="two increasing positive lengths [min, max]",
         )

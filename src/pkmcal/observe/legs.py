@@ -148,8 +148,9 @@ class LegSearchOptions:
     sigma: float = 1.0
     # number of points along an edge
     samples: int = 12
-    # fewest visible points of a leg's two edges with which it is searched
-    fewest: int = round(FEW * 2 * samples)
+    # fewest visible points of a leg's two edges with which it is searched: a third of them. Not
+    # checked within a factor of two
+    fewest: int = 8
     # share of a leg's points below which it counts as hidden instead of not found
     in_sight: float = 1 - NEARLY_ALL
     # distance from the outlines of other legs
