@@ -17,10 +17,11 @@ from pkmcal.boards.find import (
     detect_board,
     detect_markers,
     dictionary,
+    marker_outlines,
 )
 from pkmcal.boards.layout import another_grid, marker_layout
 from pkmcal.boards.prints import Print
-from pkmcal.boards.saddles import largest_block
+from pkmcal.boards.saddles import SaddleOptions, largest_block, saddles
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.files import yaml_text
@@ -559,12 +560,60 @@ def test_blocks_of_corners_separate_boards_from_textures(tmp_path, camera):
     assert largest_block(texture) == 0
 
 
-def test_windows_are_no_circles(tmp_path):
-    """Dark squares on the places of circles."""
+def flat_chessboard(counts, square, noise, turn=0.0):
+    """Grey levels uint8 of a chessboard seen from the front, without blur of its own."""
+    columns, rows = counts
+    row, column = np.indices((rows + 1, columns + 1))
+    image = np.where((row + column) % 2 == 0, 60.0, 190.0)
+    image = np.pad(image, 1, constant_values=190.0).repeat(square, 0).repeat(square, 1)
+    if turn:
+        size = (640, 480)
+        move = cv2.getRotationMatrix2D(np.array(image.shape[::-1]) / 2, turn, 1.0)
+        move[:, 2] += (np.array(size) - image.shape[::-1]) / 2
+        image = cv2.warpAffine(image, move, size, borderValue=150.0)
+        image = cv2.GaussianBlur(image, (0, 0), 0.8)
+    image = np.rint(image + np.random.default_rng(0).normal(0, noise, image.shape))
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("counts", [(3, 3), (4, 3), (3, 4)])
+@pytest.mark.parametrize("turn", [3.0, 23.0, 44.0])
+def test_the_smallest_chessboards(counts, turn):
+    image = flat_chessboard(counts, 25, 3.0, turn)
+    assert len(detect_board(image, chessboard(counts, 0.03)).ids) == counts[0] * counts[1]
+
+
+def test_phases_of_noise_are_uniform():
+    noise = np.random.default_rng(0).normal(128, 4, (480, 640))
+    image = np.clip(np.rint(noise), 0, 255).astype(np.uint8)
+    harmonic = saddles(image, SaddleOptions(false_alarms=image.size))[1]
+    assert len(harmonic) == 2000
+    assert np.mean(np.abs(harmonic.real) > np.abs(harmonic.imag)) == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_corner_without_a_place_is_not_used():
+    """A fit without blur holds for every place between two pixels."""
+    image = flat_chessboard((7, 6), 32, 3.0)
+    value = detect_board(image, chessboard((7, 6), 0.03))
+    assert len(value.ids) > 30
+    assert value.sigma.max() < 8.0  # a quarter of a square
+
+
+def test_a_marker_with_two_dark_bits():
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    marker = cv2.aruco.generateImageMarker(words, 190, 60)
+    image = cv2.GaussianBlur(np.pad(marker, 30, constant_values=255), (0, 0), 0.8)
+    assert len(marker_outlines(image)) > 0
+
+
+@pytest.mark.parametrize("pitch", [20, 60])
+def test_windows_are_no_circles(tmp_path, pitch):
+    """Sharp dark squares on the places of circles."""
     image = np.full((480, 640), 200, np.uint8)
     for row, column in np.ndindex(6, 8):
-        y, x = 60 + 60 * row, 80 + 60 * column
-        image[y - 17 : y + 17, x - 17 : x + 17] = 40
+        y, x = 60 + pitch * row, 80 + pitch * column
+        half = round(0.28 * pitch)
+        image[y - half : y + half, x - half : x + half] = 40
     cv2.imwrite(str(tmp_path / "windows.png"), image)
     with pytest.raises(InputError) as caught:
         detect_boards([tmp_path / "windows.png"], board_of(tmp_path, FILES["circle_grid"]))
@@ -604,8 +653,12 @@ def test_images_of_two_sizes(tmp_path, pictures):
         (FILES["charuco"].replace("5X5_100", "5X5_10"),
          {"where": "board.yaml, line 5, dictionary", "found": "'DICT_5X5_10'",
           "expected": "DICT_5X5_100"}),
+        (FILES["charuco"].replace("DICT_5X5_100", "foo"),
+         {"where": "board.yaml, line 5, dictionary", "found": "'foo'",
+          "expected": "a name such as DICT_4X4_50"}),
         (FILES["chessboard"].replace("0.03", "30"),
-         {"where": "board.yaml, line 3, square", "found": "30", "expected": "metres"}),
+         {"where": "board.yaml, line 3, square", "found": "30",
+          "expected": "0.03, or 30 mm"}),
         (FILES["chessboard"].replace("corners", "corner"),
          {"where": "board.yaml", "found": "neither corners nor squares",
           "expected": "either corners, the inner ones, such as [7, 6], or squares, one more "

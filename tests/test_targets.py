@@ -241,6 +241,13 @@ def test_a_still_board_is_one_measurement(board):
     np.testing.assert_allclose(np.mean(sigmas, axis=0), 1 / np.sqrt(8), rtol=0.1)
 
 
+@pytest.mark.parametrize("n", [4, 5, 8])
+def test_a_board_between_two_places_is_not_still(board, n):
+    views = corners_in_view(board, still(board, n, dict.fromkeys(range(1, n, 2), AWAY)))
+    with raises(InputError, code="board.not_still"):
+        standing_board(views)
+
+
 def test_what_all_images_share_does_not_average_out(board):
     """Corners printed in slightly wrong places: more images do not reduce the pose's covariance."""
     rng = np.random.default_rng(5)

@@ -61,14 +61,18 @@ class _Dictionary(Schema):
         raise FieldError(
             "OpenCV has no such dictionary of markers",
             found=quoted(name),
-            expected=closest(name, dictionaries()),
+            expected=closest(name, dictionaries()) or "a name such as DICT_4X4_50",
         )
 
 
 def _metres(length: float) -> float:
     """Length if plausible in metres; raises FieldError beyond LONGEST_SQUARE_SIDE."""
     if length > LONGEST_SQUARE_SIDE:
-        raise FieldError("this looks like millimetres", found=f"{length:g}", expected="metres")
+        raise FieldError(
+            "this looks like millimetres",
+            found=f"{length:g}",
+            expected=f"{length * 1e-3:g}, or {length:g} mm",
+        )
     return length
 
 
@@ -112,7 +116,7 @@ class ChessboardSchema(Schema):
         corners = info.data.get("corners")
         if (corners is None) == (squares is None):
             raise FieldError(
-                "a chessboard has one count of its pattern",
+                "a chessboard needs its corners or its squares",
                 found="neither corners nor squares" if squares is None else "corners and squares",
                 expected="either corners, the inner ones, such as [7, 6], or squares, one more each"
                 " way",

@@ -35,8 +35,8 @@ class BoardDetectionOptions:
     """Constants of the detection of a board's corners and of their fit.
 
     A corner is accepted if its fit has more pixels than unknowns, explains most of the
-    window's variance, and keeps the corner and its blur within the window; other limits count
-    corners or markers. The widths bound the cost of the search.
+    window's variance, and keeps the corner, its standard deviation and its blur within the window;
+    other limits count corners or markers. The widths bound the cost of the search.
     """
 
     # most steps of a corner's fit
@@ -260,13 +260,15 @@ def marker_outlines(
     grey = image[row, column].astype(float)
     border, inside = grey[:, : 4 * len(side)], grey[:, 4 * len(side) :]
     dark = np.median(border, axis=1)
-    light = np.quantile(inside, 1 - options.least_bits / 2, axis=1)
+    # of the outer modules the lattice leaves out a part: a corner's have 4.9 % of it, not 1 of 16
+    least = options.least_bits / 2
+    light = np.quantile(inside, 1 - least, axis=1)
     middle = (dark + light)[:, None] / 2
     share = np.mean(inside > middle, axis=1)
     marker_like = (
         (light - dark > options.marker_contrast * image_noise(image))
-        & (share >= options.least_bits)
-        & (share <= 1 - options.least_bits)
+        & (share >= least)
+        & (share <= 1 - least)
     )
     return outlines[marker_like]
 
@@ -809,18 +811,20 @@ def _judged(
     mean = np.sum(weight * grey, axis=1) / total
     variance = np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total
     remainder = np.sum(weight * fitted.residual**2, axis=1) / total
-    # A wider blur shows no edge in the window, and a corner outside it is another one.
+    # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
+    noise = np.maximum(remainder, 1 / 12)
+    covariance = np.linalg.inv(fitted.normal + 1e-9 * np.eye(7)) * noise[:, None, None]
+    sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0) / 2)
+    # A wider blur shows no edge in the window, and a corner outside it is another one; without blur
+    # grey levels do not depend on the place, which is then unknown within the window.
     radius = np.clip(options.reach * scale, options.least_radius, options.most_radius)
     good = (
         (remainder < (1 - options.least_explained) * variance)
         & (np.exp(p[:, 4]) < radius)
         & (np.hypot(p[:, 0], p[:, 1]) < radius)
+        & (sigma < radius)
         & (weight.sum(axis=1) > p.shape[1])
         & np.isfinite(p).all(axis=1)
     )
-    # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
-    noise = np.maximum(remainder, 1 / 12)
-    covariance = np.linalg.inv(fitted.normal + 1e-9 * np.eye(7)) * noise[:, None, None]
-    sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0) / 2)
     pixels = start + np.where(good[:, None], p[:, :2], 0.0)
     return Corners(pixels, good, sigma, np.concatenate([0 * p[:, :2], p[:, 2:]], axis=1))

@@ -40,7 +40,7 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
-from pkmcal.levels import CONTRADICTION_SIGMAS, MAJORITY
+from pkmcal.levels import CONTRADICTION_SIGMAS, FEW
 from pkmcal.measurements import Column, PoseSet, Rejection
 from pkmcal.measurements.effects import by_board_size
 from pkmcal.observe.repeats import REPEAT_OPTIONS, groups_of
@@ -63,9 +63,9 @@ class BoardPoseOptions:
     still: float = 0.2
     # standard deviations of the images' own noise allowed in addition
     moved: float = CONTRADICTION_SIGMAS
-    # largest share of single images that disagree; with more, the board never stood still. Two
-    # consecutive ones are a movement in any case
-    most_outlying: float = MAJORITY
+    # largest share of single images that disagree; with more, the board never stood still: one that
+    # alternates between two places has half. Two consecutive ones are a movement in any case
+    most_outlying: float = FEW
     # largest share of a pose's covariance that repeats have in common (numerical: keeps the rest
     # invertible)
     most_common: float = 0.99
