@@ -21,7 +21,7 @@ from pkmcal.judge.causes import single_causes
 from pkmcal.mechanisms import catalogue, load_mechanism, machine_from_document, mechanism_text
 from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.kinematics import inverse_result, on_manifold
-from test_nominal_model_checks import ROD, drawn, sentence
+from test_nominal_model_checks import ROD, drawn
 
 NAMES = sorted(catalogue())
 
@@ -88,30 +88,37 @@ FAULTS = {
     "of no reading": (
         "constant-legs",
         [("length: {actuated: false", "scale: 1.001\n    length: {actuated: false")],
-        "has no reading, but a scale of one; found 1.001, expected scale on legs whose length,",
+        (
+            "line 14, legs[3].scale",
+            "1.001",
+            "scale on legs whose length, crank or slider a motor moves",
+        ),
     ),
     "no ratio": (
         "gough-stewart",
         [(ROD, f"{ROD}\n    scale: 1000")],
-        "m.yaml, line 7, legs[1].scale: this value cannot be used; found 1000,",
+        ("line 7, legs[1].scale", "1000", "a number below 2"),
     ),
     "a tolerance below zero": (
         "gough-stewart",
         [("tolerance: {", "tolerance: {scale: -1e-3, ")],
-        "tolerance.scale",
+        ("line 28, tolerance.scale", "-0.001", "a number of 0 or more"),
     ),
     "two on a motor": (
         "h4-rods",
         [("length: {actuated: false", "scale: 1.001\n    length: {actuated: false")],
-        "has another scale than the other legs on its motor; found 1.0, expected 1.001.",
+        ("line 8, legs[2].scale", "1.0", "1.001"),
     ),
-}
+}  # fmt: skip
+"""Machine, changes of its file, and where the fault is, what is found and expected there."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_scale_that_cannot_be_is_named(tmp_path, fault):
-    name, changes, words = FAULTS[fault]
-    assert words in sentence(drawn(tmp_path, name, *changes))
+    name, changes, (where, found, expected) = FAULTS[fault]
+    path = drawn(tmp_path, name, *changes)
+    with raises(InputError, where=f"m.yaml, {where}", found=found, expected=expected):
+        load_mechanism(path)
 
 
 # Kinematics
