@@ -355,6 +355,8 @@ def _attempts(
         # On a large cluttered picture the second way takes seconds.
         large = picture.shape[1] > options.searched_width
         for attempt in ways[:1] if quick or large else ways:
+            # OpenCV's detector draws random numbers: the same image shall give the same corners
+            cv2.setRNGSeed(0)
             value, corners = attempt()
             if value and _length(corners) == counts[0] * counts[1]:
                 pixels = np.asarray(corners, dtype=float).reshape(-1, 2)
