@@ -178,7 +178,8 @@ class Rig:
     shading : px, standard deviation of the common shift of edges of one side of a tube at one
         station.
     where : prefix of a station's name in messages; None without a file.
-    temperatures : of the configurations, repeated in their order; None without a column of them.
+    temperatures, forces : of the configurations, repeated in their order; None where joints.csv has
+        none.
     """
 
     machine: Machine
@@ -192,6 +193,7 @@ class Rig:
     shading: float = SHADING_SIGMA
     where: str | None = "session.yaml, stations."
     temperatures: Array | None = None
+    forces: Array | None = None
 
     __repr__ = short_repr
 
@@ -242,7 +244,10 @@ class Rig:
                 self.machine,
                 joints,
                 T_base_platform,
-                None if self.temperatures is None else np.resize(self.temperatures, len(joints)),
+                *(
+                    None if x is None else np.resize(x, (len(joints), *x.shape[1:]))
+                    for x in (self.temperatures, self.forces)
+                ),
             ),
         )
 
