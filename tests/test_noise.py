@@ -214,6 +214,18 @@ def pose_problem(name, pairs=()):
     return assembled.problem, batch_of(truth, assembled, start)
 
 
+def test_directions_of_the_prior_alone_contradict_no_noise():
+    """Nominal errors of degrees: their second order is in the residuals, and not in the shares."""
+    z = np.random.default_rng(3).normal(size=(1, 60))
+    own = np.full((1, 60), 0.9)
+    z[:, :3], own[:, :3] = [39.0, 32.0, -9.0], 3e-7
+    others = np.full((1, 60), 0.02)
+    others[:, :3] = 1e-7
+    shares = NoiseShares(z, own, others, 1 - own - others)
+    assert not shares.contradicts()
+    assert shares.best == pytest.approx(1, abs=0.3)
+
+
 @pytest.mark.parametrize("name", ["edges", "h4", "h4-rods", "h4 with distances"])
 def test_traces_are_those_of_the_hat_matrix(name):
     """All rows as one dense matrix; h4-rods has two rods for a motor, of which half a row each is

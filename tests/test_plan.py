@@ -278,6 +278,8 @@ def test_a_board_is_seen_from_its_face_only():
     assert len(one.measure(at, np.arange(1), None)) == 1
     turned = one.T_body_board @ np.diag([1.0, -1.0, -1.0, 1.0])
     assert len(replace(one, T_body_board=turned).measure(at, np.arange(1), None)) == 0
+    in_a_row = one.points[:1] + np.linspace(0, 0.05, 20)[:, None] * [1.0, 0.0, 0.0]
+    assert len(replace(one, points=in_a_row).measure(at, np.arange(1), None)) == 0
 
 
 # ------------------------------------------------------------------ the way

@@ -130,6 +130,7 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
             "breathing": Range(0, 1),
             "shake": Range(0, 1),
             "warming": Range(0, 200, default=0.0),
+            "force": Range(0, 1e6, default=0.0),
             "seed": _SEED,
         },
         "study": {"runs": _whole(2, 1_000_000, 100), "seed": _SEED},

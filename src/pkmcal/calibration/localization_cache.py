@@ -44,19 +44,19 @@ def session_name(
     session: Session, stations: Sequence[int], boards: Boards, scene: PriorScene
 ) -> str:
     """Name of the localization of all hand-held images: the nominal model, readings, their noise
-    and temperatures, image files, cameras, rough poses and names of stations, boards, and poses of
-    the stations that were localized before.
+    temperatures and forces, image files, cameras, rough poses and names of stations, boards, and
+    poses of the stations that were localized before.
 
     stations : that observe legs. scene : of the nominal model.
     """
     stood = [(k, one.stood and one.stood.T_camera_board) for k, one in boards.stations.items()]
-    poses, temperature = boards.poses, session.temperature
+    poses = boards.poses
     digest = digest_of(
         session.machine.to_document(),
         session.machine.values,
         session.joints,
         session.joint_noise,
-        np.zeros(0) if temperature is None else temperature,
+        *(np.zeros(0) if x is None else x for x in (session.temperature, session.forces)),
         [
             [k, session.label(k), session.stations[k].handheld, _stated(session, k)]
             for k in stations

@@ -41,7 +41,7 @@ from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms import machine_from_document
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
 from pkmcal.mechanisms.closure import scales as scales_of
-from pkmcal.mechanisms.disturbances import compliance, tool_shift, weight_on_readings
+from pkmcal.mechanisms.disturbances import is_compliant, tool_shift, weight_on_readings
 from pkmcal.mechanisms.joints import screw_turns
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
@@ -514,17 +514,19 @@ def _screw_leads(
 def _sag(
     session: Session, observation: Observation, measured: Measurements, estimate: Estimate
 ) -> Iterator[Column]:
-    """Drives that yield under a load, of a stiffness that the mechanism file does not state; one
-    compliance for all of them.
+    """Drives that yield under a load or measured forces, of a stiffness that the mechanism file
+    does not state; one compliance for all of them.
     """
-    del session, observation
+    del observation
     machine, used = estimate.machine, estimate.configurations
-    load = machine.document.load
-    if load is None or compliance(machine) is not None or len(set(machine.joint_units)) > 1:
+    load, forces = machine.document.load, session.forces
+    if (load is None and forces is None) or is_compliant(machine):
+        return
+    if len(set(machine.joint_units)) > 1:
         return
     poses = estimate.state.T_base_platform[used]
     by = np.zeros((*measured.joints.shape, 1))
-    by[used, :, 0] = weight_on_readings(machine, poses)
+    by[used, :, 0] = weight_on_readings(machine, poses) if forces is None else forces[used]
     shift = tool_shift(machine, poses, by[used, :, 0])
     size = float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1))))
 
@@ -532,13 +534,14 @@ def _sag(
         return {
             "value": value[0],
             "sigma": sigma[0],
-            "mass": load.mass,
+            "by": "load" if forces is None else "forces",
+            "mass": load.mass if load and forces is None else None,
             "sinks": size * value[0],
             "stiffness": 1 / value[0] if value[0] > 0 else None,
         }
 
     yield Column(
-        "machine.sag", "drives", "sag under the load", readings=by, facts=facts, positive=True
+        "machine.sag", "drives", "yielding drives", readings=by, facts=facts, positive=True
     )
 
 

@@ -1,8 +1,8 @@
-"""Effects on the readings that a mechanism file or a session states: sag under a load, thermal
-growth.
+"""Effects on the readings that a mechanism file or a session states: sag under a load or stretch by
+measured forces, thermal growth.
 
-An effect has k coefficients with a prior: the compliance of the drives relative to what the file
-states, the growth of drives and frame per kelvin (:mod:`pkmcal.mechanisms.disturbances`). The
+An effect has k coefficients with a prior: the compliance of drives and legs relative to what the
+file states, the growth of drives and frame per kelvin (:mod:`pkmcal.mechanisms.disturbances`). The
 change of the readings by the prior mean is a known correction; the deviations of the coefficients
 from the mean are unknowns of the estimate, with one column for each effect
 (:mod:`pkmcal.measurements.columns`). The calibrated machine's file states the estimated
@@ -24,9 +24,9 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Column, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.disturbances import (
-    compliance,
     growth_by_readings,
     growth_of,
+    is_compliant,
     sag,
     tool_shift,
 )
@@ -77,15 +77,21 @@ class ReadingEffect:
 
 
 def reading_effects(
-    machine: Machine, joints: Array, poses: Array, temperature: Array | None
+    machine: Machine,
+    joints: Array,
+    poses: Array,
+    temperature: Array | None,
+    forces: Array | None = None,
 ) -> tuple[ReadingEffect, ...]:
-    """Effects on readings (K, m), at poses T_base_platform (K, 4, 4) and temperatures (K,), °C,
-    None without temperatures.
+    """Effects on readings (K, m), at poses T_base_platform (K, 4, 4).
+
+    temperature : (K,) °C, forces : (K, m) on the readings, N or N m; None where not measured.
     """
     out: list[ReadingEffect] = []
-    if compliance(machine) is not None:
+    if _yields(machine, forces):
         root = np.full((1, 1), machine.document.tolerance.stiffness or STIFFNESS_TOLERANCE)
-        out.append(ReadingEffect(COMPLIANCE, sag(machine, poses)[..., None], np.ones(1), root))
+        by = sag(machine, poses, forces)[..., None]
+        out.append(ReadingEffect(COMPLIANCE, by, np.ones(1), root))
     if temperature is not None:
         growth = growth_of(machine, temperature)
         warmer = (temperature - growth.temperature)[:, None, None]
@@ -104,12 +110,17 @@ def effects_of_session(
     session: Session, estimate: Estimate | None = None
 ) -> tuple[ReadingEffect, ...]:
     """Effects on a session's readings, by the nominal machine or by an earlier estimate."""
-    if session.temperature is None and compliance(session.machine) is None:
+    if session.temperature is None and not _yields(session.machine, session.forces):
         return ()  # forward kinematics are slow, and may fail
     machine, poses = session.machine, session.forward.T_base_platform
     if estimate is not None:
         machine, poses = estimate.machine, estimate.state.T_base_platform
-    return reading_effects(machine, session.joints, poses, session.temperature)
+    return reading_effects(machine, session.joints, poses, session.temperature, session.forces)
+
+
+def _yields(machine: Machine, forces: Array | None) -> bool:
+    """Whether the file states a compliance, and forces are measured or follow from a load."""
+    return is_compliant(machine) and not (forces is None and machine.document.load is None)
 
 
 def with_estimated_effects(session: Session, estimate: Estimate) -> Estimate:
@@ -120,7 +131,12 @@ def with_estimated_effects(session: Session, estimate: Estimate) -> Estimate:
         sigma = np.sqrt(np.diag(covariance))
         if effect.code == COMPLIANCE and value[0] > 0:
             legs = tuple(
-                leg.model_copy(update={"stiffness": leg.stiffness and leg.stiffness / value[0]})
+                leg.model_copy(
+                    update={
+                        "stiffness": leg.stiffness and leg.stiffness / value[0],
+                        "axial_rigidity": leg.axial_rigidity and leg.axial_rigidity / value[0],
+                    }
+                )
                 for leg in document.legs
             )
             tolerance = document.tolerance.model_copy(
@@ -145,15 +161,20 @@ def effect_notes(session: Session, estimate: Estimate) -> Iterator[Finding]:
     for effect in effects_of_session(session):
         value, covariance = effect.estimated(estimate)
         sigma = np.sqrt(np.diag(covariance))
-        if effect.code == COMPLIANCE and document.load is not None:
+        if effect.code == COMPLIANCE:
+            load, forces = document.load, session.forces
             poses = estimate.state.T_base_platform[used]
-            shift = tool_shift(estimate.machine, poses, value[0] * sag(session.machine, poses))
+            yields = sag(session.machine, poses, None if forces is None else forces[used])
+            shift = tool_shift(estimate.machine, poses, value[0] * yields)
             facts = {
                 "value": float(value[0]),
                 "sigma": float(sigma[0]),
                 "prior": float(effect.root[0, 0]),
-                "mass": document.load.mass,
-                "tool_shift": float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1)))),
+                "by": "load" if forces is None else "forces",
+                "mass": load.mass if load and forces is None else None,
+                "tool_shift": None
+                if estimate.machine.layout.underdetermined
+                else float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1)))),
             }
             if value[0] > 0:
                 yield note("machine.compliance", **facts)

@@ -239,6 +239,7 @@ def _rig(
         ),
         shading=first.estimate.statistics.shading,
         temperatures=session.temperature,
+        forces=session.forces,
     )
 
 

@@ -43,6 +43,10 @@ IMAGES, BOARD = "Images", "Board"
         "simulate", "warming", "K", "Warming of the machine over the session, kelvin; its"
         " temperatures are then in joints.csv."
     ),
+    number(
+        "simulate", "force", "N", "Mean force on each reading, N, of cranks and spools N m; forces"
+        " are then in joints.csv, and stretch legs whose file states how far they yield."
+    ),
     option(
         "--plan", "PLAN", "Folder of a plan: its machine, stations, what they observe, and"
         " configurations.", Path,

@@ -27,8 +27,8 @@ from pkmcal.exporters.samples import samples
 from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.levels import MAJORITY
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.disturbances import compliance, growth_by_readings, sag, tool_shift
-from pkmcal.outcome.finding import Finding, Level, note
+from pkmcal.mechanisms.disturbances import growth_by_readings, is_compliant, sag, tool_shift
+from pkmcal.outcome.finding import Finding, Level, doubtful, note
 from pkmcal.wording import listed
 
 FORMAT_PACKAGES = ("pkmcal.exporters", "pkmcal.firmware")
@@ -213,11 +213,13 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
 
 def _without_effects(machine: Machine, name: str) -> Iterator[Finding]:
     """Notes on sag and thermal growth, with what they do to the tool, at the compared poses."""
-    sags, growth = compliance(machine) is not None, machine.document.growth
-    if not sags and growth is None:
+    compliant, growth = is_compliant(machine), machine.document.growth
+    if not compliant and growth is None:
         return
     poses, joints = samples(machine)
-    if sags:
+    if compliant and machine.document.load is None:
+        yield doubtful("export.without_stretch", program=name)
+    elif compliant:
         sunk = np.linalg.norm(tool_shift(machine, poses, sag(machine, poses)), axis=-1)
         least = float(sunk.min())
         yield _by_error(

@@ -18,7 +18,6 @@ from pkmcal.measurements.distances import Distances
 from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import MechanismDocument, checked_machine
 from pkmcal.starter import (
-    STARTER_SQUARE_CHOICES,
     board_text,
     example_readings,
     session_texts,
@@ -198,7 +197,6 @@ def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     # the corners of 7 by 5 squares stay within the print radius while the tool goes half as far:
     # only there no tower is in the way
     reach = printer.reach
-    square = 0 if reach is None else int(reach / np.hypot(7, 5))
     head = CARRIED_BOARD_SESSION_TEXT.format(
         where=printer.firmware.carriage_source.replace("\n", "\n#" + 26 * " "),
         size="the smallest size, since the file has no print radius"
@@ -210,9 +208,7 @@ def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     texts["session.yaml"] = head + session[session.index("# One entry") :]
     texts["mechanism.yaml"] = nominal
     texts["joints.csv"] = example_readings(machine, heads)
-    texts["board.yaml"] = board_text(
-        min(max(square, STARTER_SQUARE_CHOICES[0]), STARTER_SQUARE_CHOICES[-1])
-    )
+    texts["board.yaml"] = board_text(0.0 if reach is None else reach / 1e3)
     return texts
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
-from pkmcal.identify.tool import pose_by_parameters
+from pkmcal.identify.tool import pose_by_parameters, reachable
 from pkmcal.levels import ALIGNED_ANGLE, NAMED_SHARE, NEARLY_ALL, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
@@ -474,8 +474,8 @@ def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
         if len(coefficients) > 1:
             return ""
         what, unit = changes(coefficients[0], labels)
-        poses = s.T_base_platform
-        shifted = pose_by_parameters(s.machine, s.readings, poses)
+        joints, poses = reachable(s.machine, s.T_base_platform)
+        shifted = pose_by_parameters(s.machine, joints, poses)
         shifted = shifted @ columns @ coefficients[0] * unit
         xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)
         stretch = float(np.sum(shifted[:, 3:5] * xy) / np.sum(xy**2))

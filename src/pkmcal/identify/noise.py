@@ -13,7 +13,9 @@ residuals are independent normal numbers z of the variances
 
 and contain all information about s: restricted maximum likelihood (Patterson and Thompson 1971). F
 is approximated by its diagonal there; it is small beside the others wherever the data contain
-information about s.
+information about s. Directions of which F is nearly all are not part of the likelihood: unknowns
+absorb them but for the prior's errors, of which the second order, which is not in M, may be many
+times the first (nominal errors of degrees).
 
 t is unknown, a nuisance parameter. Errors of the edges of a line are correlated, and no other
 residual shows how much of their common error a pose absorbs; so where readings are far sharper than
@@ -143,7 +145,7 @@ class NoiseShares:
         """Factor s (B,) of the highest likelihood, 0 where that is the smallest value of the
         grid.
         """
-        return np.sqrt(self._best[0])
+        return np.sqrt(self.highest[0])
 
     def factor(self) -> Array:
         """Factor (B,) on the kind's noise for the next step.
@@ -192,14 +194,24 @@ class NoiseShares:
         """
         from scipy.special import chdtrc
 
-        informative = self.own > NEGLIGIBLE * self.own.max(axis=1, keepdims=True, initial=0.0)
-        z, own, others = (
-            np.where(informative, part, 0.0) for part in (self.z, self.own, self.others)
+        shares = self._only(
+            self.own > NEGLIGIBLE * self.own.max(axis=1, keepdims=True, initial=0.0)
         )
-        shares = NoiseShares(z, own, others, np.where(informative, self.fixed, 1.0), self.options)
         variance = shares.own / scale[:, None] ** 2 + shares.others + shares.fixed
         stated = np.sum(np.log(variance) + shares.z**2 / variance, axis=-1)
-        return chdtrc(2, np.maximum(stated - shares._best[1], 0.0))
+        return chdtrc(2, np.maximum(stated - shares.highest[1], 0.0))
+
+    def _only(self, directions: Booleans) -> NoiseShares:
+        """Only some directions (B, n), the others as padding."""
+        z, own, others = (
+            np.where(directions, part, 0.0) for part in (self.z, self.own, self.others)
+        )
+        return NoiseShares(z, own, others, np.where(directions, self.fixed, 1.0), self.options)
+
+    @cached_property
+    def _by_data(self) -> NoiseShares:
+        """The directions in the likelihood: all but those of the prior alone."""
+        return self._only(self.fixed <= 1 - NEGLIGIBLE)
 
     @cached_property
     def _intervals(self) -> dict[float, tuple[Array, Array]]:
@@ -213,7 +225,7 @@ class NoiseShares:
         n_runs, n = self.z.shape
         if not n:
             return np.zeros(n_runs), np.full(n_runs, np.inf)
-        (best, least), tried = self._best, self.options.log_variances
+        (best, least), tried = self.highest, self.options.log_variances
         level = least + chdtri(1, chance)
         inside = self._grid <= level[:, None]
         with np.errstate(divide="ignore"):
@@ -260,8 +272,9 @@ class NoiseShares:
     def _freedom(self, square: Array) -> Array:
         """:meth:`freedom` (B, G) of s^2 (B, G)."""
         others = np.exp(self._profile(square)[1])[..., None]
-        own = square[..., None] * self.own[:, None]
-        variance = own + others * self.others[:, None] + self.fixed[:, None]
+        shares = self._by_data
+        own = square[..., None] * shares.own[:, None]
+        variance = own + others * shares.others[:, None] + shares.fixed[:, None]
         return np.sum((own / np.maximum(variance, self.options.least_variance)) ** 2, axis=-1)
 
     @cached_property
@@ -272,7 +285,7 @@ class NoiseShares:
         return self._profile(np.broadcast_to(tried, (len(self.z), len(tried))))[0]
 
     @cached_property
-    def _best(self) -> tuple[Array, Array]:
+    def highest(self) -> tuple[Array, Array]:
         """s^2 (B,) of the highest likelihood, and -2 log likelihood there."""
         run, at = np.arange(len(self.z)), np.argmin(self._grid, axis=1)
         tried = self.options.log_variances
@@ -290,8 +303,9 @@ class NoiseShares:
 
     def _profile(self, square: Array) -> tuple[Array, Array]:
         """-2 log profile likelihood (B, G) of s^2 (B, G), and the best log t^2."""
-        own = square[..., None] * self.own[:, None] + self.fixed[:, None]
-        others, squares = self.others[:, None], np.square(self.z)[:, None]
+        shares = self._by_data
+        own = square[..., None] * shares.own[:, None] + shares.fixed[:, None]
+        others, squares = shares.others[:, None], np.square(shares.z)[:, None]
         options, least_variance = self.options, self.options.least_variance
 
         def value(log: Array) -> Array:

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
@@ -105,7 +105,10 @@ def platform_sigma(estimate: Estimate) -> float:
 
 
 def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
-    """Readings and poses of the session, and of samples around it that the machine can take."""
+    """Readings and poses of the session, and of samples around it, that the machine can take.
+
+    Raises ResultError if it can take none.
+    """
     rng = np.random.default_rng(_SAMPLING.seed)
     layout = machine.layout
     base, platform = machine.base_centers(), machine.platform_centers()
@@ -118,9 +121,23 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     # constant legs and joints with axes restrict the poses: samples are projected onto these
     value = on_manifold(layout, machine.values, start)
     own = on_manifold(layout, machine.values, T_base_platform).singularity
-    regular = value.converged & (value.singularity >= _SAMPLING.regular * float(np.median(own)))
-    poses = np.concatenate([T_base_platform, value.T_base_platform[regular]])
-    return machine.inverse(poses), poses
+    regular = value.converged & (value.singularity >= _SAMPLING.regular * float(np.nanmedian(own)))
+    return reachable(machine, np.concatenate([T_base_platform, value.T_base_platform[regular]]))
+
+
+def reachable(machine: Machine, poses: Array) -> tuple[Array, Array]:
+    """Readings (n, m) and poses (n, 4, 4), of those poses (N, 4, 4) that the machine can take.
+
+    Estimated poses close the machine up to the readings' noise: where cranks and rods are nearly in
+    line, no readings close it exactly. Raises ResultError if it can take none.
+    """
+    joints = machine.inverse(poses)
+    closes = np.isfinite(joints).all(axis=-1)
+    if not closes.any():
+        raise ResultError(
+            what="the estimated machine can take none of the poses at which it was measured"
+        )
+    return joints[closes], poses[closes]
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,15 @@
-"""Readings under a load and in warmth: what weight and temperature do to a machine's drives.
+"""Readings under forces and in warmth: what weight, tension and temperature do to a machine's
+drives.
 
 Weight. Without friction, motor power equals platform power, so the weight's wrench w on the
 platform is a force J^T w on the readings, with J the forward Jacobian
-(:mod:`pkmcal.mechanisms.velocities`). A drive of stiffness k yields by J^T w / k: its true motion
-is the reading plus that, negative where a leg is compressed.
+(:mod:`pkmcal.mechanisms.velocities`). Where forces f on the readings are measured, as the tensions
+of cables, they take the place of J^T w.
+
+Compliance. A drive of stiffness k yields by f / k: its true motion is the reading plus that,
+negative where a leg is compressed. A leg of length L, axial rigidity EA and derivative s of its
+length by the reading is a spring of stiffness EA s^2 / L in series with its drive; legs on one
+motor are springs in parallel.
 
 Warmth. With a temperature T, of lengths that hold at T0, a length L is L (1 + g (T - T0)), with one
 coefficient g for drives (screws, racks and their zeros) and one for the frame (joint centres, arms,
@@ -17,9 +23,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.geometry.rigid import cross
-from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.mechanisms.closure import by_motors, closure, dense
 from pkmcal.mechanisms.document import Growth
-from pkmcal.mechanisms.kinematics import inverse_result, readings_at_poses
+from pkmcal.mechanisms.kinematics import closure_at, inverse_result, readings_at_poses
 from pkmcal.mechanisms.machine import Machine
 
 
@@ -37,17 +43,40 @@ def weight_on_readings(machine: Machine, poses: Array) -> Array:
     return np.nan_to_num(force[..., 0])
 
 
-def compliance(machine: Machine) -> Array | None:
-    """Compliance (m,) of each drive, m/N or rad/(N m); None where the file states no stiffness."""
-    legs, column = machine.document.legs, machine.layout.actuated
-    first = [legs[int(np.argmax(column == m))].stiffness for m in range(machine.n_joints)]
-    return None if None in first else 1 / np.array(first, dtype=float)
+def is_compliant(machine: Machine) -> bool:
+    """Whether the file states how far the drives or the legs yield."""
+    return any(leg.stiffness or leg.axial_rigidity for leg in machine.document.legs)
 
 
-def sag(machine: Machine, poses: Array) -> Array:
-    """What each drive yields by under the load (..., m), m or rad; zero without a stiffness."""
-    yields = compliance(machine)
-    return weight_on_readings(machine, poses) * (0.0 if yields is None else yields)
+def compliance(machine: Machine, poses: Array) -> Array:
+    """Compliance (..., m) of each reading at poses T_base_platform (..., 4, 4), m/N or rad/(N m),
+    by what the file states; zero of what it does not.
+    """
+    layout, legs = machine.layout, machine.document.legs
+    first = [legs[int(np.argmax(layout.actuated == m))] for m in range(machine.n_joints)]
+    drives = np.array([1 / leg.stiffness if leg.stiffness else 0.0 for leg in first])
+    out = np.broadcast_to(drives, (*poses.shape[:-2], len(drives)))
+    if not any(leg.axial_rigidity for leg in legs):
+        return out
+    at = closure_at(layout, machine.values, poses)
+    rigidity = np.array([leg.axial_rigidity or 0.0 for leg in legs])
+    spring = (rigidity / at.rows.distance)[..., layout.closing]
+    lengths = by_motors(layout, at.by_reading)[..., : spring.shape[-1], :]
+    return out + 1 / np.sum(lengths**2 * spring[..., None], axis=-2)
+
+
+def sag(machine: Machine, poses: Array, forces: Array | None = None) -> Array:
+    """What each reading's drive and legs yield by (..., m), m or rad; zero where the file states
+    neither a stiffness nor a rigidity.
+
+    forces : (..., m) measured on the readings, N, of cranks and spools N m, positive where they
+        lengthen a leg; None for those of the load.
+    """
+    if not is_compliant(machine):
+        return np.zeros((*poses.shape[:-2], machine.n_joints))
+    if forces is None:
+        forces = weight_on_readings(machine, poses)
+    return forces * compliance(machine, poses)
 
 
 def tool_shift(machine: Machine, poses: Array, readings: Array) -> Array:

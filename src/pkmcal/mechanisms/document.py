@@ -245,11 +245,20 @@ class Leg(Schema):
         ]
         | None
     ) = None  # fmt: skip
+    axial_rigidity: (
+        Annotated[
+            float,
+            Field(gt=0, le=1e15, description="modulus times cross-section EA of the cable or rod,"
+                  " N: the force over the strain, such as 2.0e4"),
+        ]
+        | None
+    ) = None  # fmt: skip
     tubes: Annotated[tuple[Tube, ...], Field(max_length=MOST_LEG_TUBES)] = ()
 
 
 class Load(Schema):
-    """Weight on the platform, under which drives yield by their legs' ``stiffness``.
+    """Weight on the platform, under which drives yield by their legs' ``stiffness`` and
+    ``axial_rigidity``.
 
     mass : kg, of the platform with all that it carries. center : its centre, platform frame, m.
     gravity : m/s^2, base frame.

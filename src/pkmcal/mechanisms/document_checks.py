@@ -197,27 +197,22 @@ def _check_scales(document: MechanismDocument, place: PlaceInDocument) -> None:
 
 def _check_load(document: MechanismDocument, place: PlaceInDocument) -> None:
     """Check that a load's forces on the drives follow from statics, and that all drives have a
-    stiffness or none.
+    stiffness or none, and all their legs an axial rigidity or none.
     """
     columns, legs = motor_columns(document), document.legs
-    stated = any(leg.stiffness is not None for leg in legs)
-    for j, leg in enumerate(legs):
-        first = legs[int(np.argmax(columns == columns[j]))]
-        right = (leg.stiffness is not None) == (stated and columns[j] >= 0)
-        if not right or (columns[j] >= 0 and leg.stiffness != first.stiffness):
-            raise InputError(
-                f"the stiffness of leg {j + 1} does not suit its drive",
-                where=place("legs", j, "stiffness"),
-                found=str(leg.stiffness),
-                expected="a stiffness for each leg that a motor moves, equal for legs on one motor,"
-                " or for none",
-            )
-    if stated and document.load is None:
-        raise InputError(
-            "drives have a stiffness, but there is no load under which they yield",
-            where=place("load"),
-            expected="load: {mass: the mass on the platform in kg, center: [x, y, z]}",
-        )
+    for key in ("stiffness", "axial_rigidity"):
+        stated = any(getattr(leg, key) is not None for leg in legs)
+        for j, leg in enumerate(legs):
+            value, first = getattr(leg, key), legs[int(np.argmax(columns == columns[j]))]
+            right = (value is not None) == (stated and columns[j] >= 0)
+            if not right or (columns[j] >= 0 and value != getattr(first, key)):
+                raise InputError(
+                    f"the {key} of leg {j + 1} does not suit its drive",
+                    where=place("legs", j, key),
+                    found=str(value),
+                    expected=f"{key} for each leg that a motor moves, equal for legs on one motor,"
+                    " or for none",
+                )
     if document.load is not None and n_equations(document) > n_freedoms(document):
         raise InputError(
             "a load's forces on more legs than the platform has freedoms do not follow from"

@@ -35,6 +35,7 @@ from pkmcal.observe.predict import tubes_of
 from pkmcal.placement.edges import hidden, pixel_angle, simulate_edges
 from pkmcal.planning.defaults import NOMINAL_CORNER_SIGMA, NOMINAL_EDGE_SIGMA
 from pkmcal.planning.first import EXACT_EDGE_NOISE, FIRST_EDGES_SEED, EdgePool, Pools, drawn_edges
+from pkmcal.solver.ranks import NORMAL_RANK_TOLERANCE, unit_diagonal
 
 FLATTEST_BOARD_COSINE = np.cos(np.deg2rad(70))
 """Minimum cosine of the angle between a board's normal and the line of sight."""
@@ -107,7 +108,7 @@ class BoardFrom:
     on_platform: bool = True
 
     def measure(self, at: At, rows: Integers, _rng: np.random.Generator | None, /) -> PoseSet:
-        """Poses of the board where enough corners are visible."""
+        """Poses of the board where enough corners are visible, not all of them on one line."""
         T_base_body = at.T_base_platform[rows] if self.on_platform else np.eye(4)
         T = np.tile(self.T_camera_base, (len(rows), 1, 1)) @ T_base_body @ self.T_body_board
         there = apply(T[:, None], self.points)
@@ -119,7 +120,9 @@ class BoardFrom:
         by_pose = np.concatenate([-by_point @ skew(there - T[:, None, :3, 3]), by_point], axis=-1)
         by_pose = np.where(visible[..., None, None], by_pose, 0.0) / self.sigma
         normal = np.einsum("knip,kniq->kpq", by_pose, by_pose)
+        values = np.linalg.eigvalsh(unit_diagonal(normal)[0])
         enough = visible.sum(axis=1) >= BOARD_POSE_OPTIONS.least_weight
+        enough &= values[:, 0] > NORMAL_RANK_TOLERANCE * values[:, -1]
         covariance = np.linalg.inv(normal[enough])
         return pose_set(self.station, rows[enough], self.mount, T[enough], covariance)
 
@@ -178,7 +181,8 @@ class Rig:
     shading : px, standard deviation of the common shift of edges of one side of a tube at one
         station.
     where : prefix of a station's name in messages; None without a file.
-    temperatures : of the configurations, repeated in their order; None without a column of them.
+    temperatures, forces : of the configurations, repeated in their order; None where joints.csv has
+        none.
     """
 
     machine: Machine
@@ -192,6 +196,7 @@ class Rig:
     shading: float = SHADING_SIGMA
     where: str | None = "session.yaml, stations."
     temperatures: Array | None = None
+    forces: Array | None = None
 
     __repr__ = short_repr
 
@@ -242,7 +247,10 @@ class Rig:
                 self.machine,
                 joints,
                 T_base_platform,
-                None if self.temperatures is None else np.resize(self.temperatures, len(joints)),
+                *(
+                    None if x is None else np.resize(x, (len(joints), *x.shape[1:]))
+                    for x in (self.temperatures, self.forces)
+                ),
             ),
         )
 

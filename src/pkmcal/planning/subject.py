@@ -422,6 +422,7 @@ def _rig(
         np.array(T_mount).reshape(-1, 4, 4),
         shading,
         temperatures=session.temperature,
+        forces=session.forces,
     )
     return rig, board, words
 

@@ -45,18 +45,20 @@ from pkmcal.files import (
     written_unit,
 )
 from pkmcal.geometry.rigid import look_at
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import LinkKind, kinds_of, measurement_kinds
 from pkmcal.measurements.heights import Heights
 from pkmcal.measurements.tracker_poses import TrackerPoses
 from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanism
+from pkmcal.mechanisms.disturbances import is_compliant, sag, tool_shift
 from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.mechanisms.region import Region
 from pkmcal.outcome.finding import Finding, Level, doubtful, note
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
 from pkmcal.session.image_files import Image, find_images, image_header, label_of
 from pkmcal.session.poses import PoseTable, read_poses
-from pkmcal.session.readings import check_readings, without_repeats, without_temperature
+from pkmcal.session.readings import JointTable, check_readings, joint_table, without_repeats
 from pkmcal.session.schema import (
     BoardBody,
     PoseDocument,
@@ -146,6 +148,8 @@ class Session:
     rejected : stations that were removed because their images do not determine their poses.
     links : measurements that depend on two configurations, by kind.
     temperature : (K,) °C, of the configurations; None where joints.csv has none.
+    forces : (K, m) on the readings, N or N m, positive where they lengthen a leg; None where
+        joints.csv has none.
     earlier_joints : (E, m) readings of the same machine at other poses; None for none. The
         localization of few images is tested against them as well.
     reading_units : units in the heads of joints.csv's m columns, None for SI; empty without any.
@@ -168,6 +172,7 @@ class Session:
     rejected: tuple[RejectedStation, ...] = ()
     links: tuple[LinkSet, ...] = ()
     temperature: Array | None = None
+    forces: Array | None = None
     earlier_joints: Array | None = None
     reading_units: tuple[Unit | None, ...] = ()
 
@@ -321,7 +326,8 @@ def load_session(
     schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model, held=False)
     # Joint readings.
-    table, temperature, findings = _readings(folder, document, schema, machine, measured, fewest)
+    logged, findings = _readings(folder, document, schema, machine, measured, fewest)
+    table = logged.readings
     # Board, camera stations and trackers.
     board = _board(folder, document, schema)
     findings += _unused_board(document, schema)
@@ -334,6 +340,8 @@ def load_session(
     trackers = _trackers(folder, document, schema, table.names, measured)
     links = _links(folder, document, schema, table.names, machine) if measured else ()
     findings += _default_noise(trackers, links)
+    if measured:
+        findings += _forces(machine, logged)
     # Checks across files.
     if machine.layout.underdetermined and (stations or not _all_tracked(table, trackers)):
         _machine(folder, document, schema.mechanism, model, held=True)
@@ -350,11 +358,12 @@ def load_session(
         machine=machine,
         configurations=table.names,
         joints=table.values,
-        temperature=temperature,
+        temperature=logged.temperature,
+        forces=logged.forces,
         joint_noise=schema.joints.noise,
         stations=stations,
         board=board,
-        document=_resolved_document(folder, schema, table, temperature, stations),
+        document=_resolved_document(folder, schema, logged, stations),
         findings=tuple(findings),
         board_body=schema.board.fixed_to if schema.board else "platform",
         trackers=trackers,
@@ -391,27 +400,56 @@ def _readings(
     machine: Machine,
     measured: bool,
     fewest: int,
-) -> tuple[CsvTable, Array | None, list[Finding]]:
-    """Table of the joint readings, temperatures (K,) where it has them, and findings on them; empty
-    where none exist before a plan.
+) -> tuple[JointTable, list[Finding]]:
+    """Readings, forces and temperatures, and findings on them; empty where none exist before a
+    plan.
     """
     if not measured and not (folder / schema.joints.file).exists():
         none = np.zeros((0, machine.n_joints))
-        return CsvTable(schema.joints.file, machine.joint_names, (), none, ()), None, []
+        empty = CsvTable(schema.joints.file, machine.joint_names, (), none, ())
+        return JointTable(empty, None, None), []
     path = _regular_file(folder, document, schema.joints.file, ("joints", "file"))
     whole, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
-    table, temperature = without_temperature(whole)
+    logged = joint_table(whole, machine.joint_units)
     written = written_unit(document.data["joints"]["noise"])
     if written and written.kind not in machine.joint_units:
         error = no_such(machine.joint_units[0], document.data["joints"]["noise"]).error
         raise error.located(document.where("joints", "noise"))
-    findings = check_readings(table, machine.joint_ranges, noise, machine.joint_units, fewest)
+    findings = check_readings(
+        logged.readings, machine.joint_ranges, noise, machine.joint_units, fewest
+    )
     if measured and not schema.stations and not schema.links():
         _check_redundant(document, machine)
-        whole, repeated = without_repeats(whole, table, noise)
-        table, temperature = without_temperature(whole)
+        whole, repeated = without_repeats(whole, logged.readings, noise)
+        logged = joint_table(whole, machine.joint_units)
         findings += repeated
-    return table, temperature, findings
+    return logged, findings
+
+
+def _forces(machine: Machine, logged: JointTable) -> list[Finding]:
+    """Warning about stated compliances without forces. Raises InputError for forces that shift the
+    tool at home by more than NEGLIGIBLE of the machine's size: the correction is of first order.
+    """
+    if not is_compliant(machine):
+        return []
+    label, forces = logged.readings.label, logged.forces
+    if forces is None:
+        return [] if machine.document.load else [doubtful("readings.forces_unknown", label)]
+    home = machine.home()
+    shift = tool_shift(machine, home, sag(machine, home, forces))
+    distance = np.linalg.norm(shift, axis=-1)
+    row, most = int(np.argmax(np.nan_to_num(distance))), NEGLIGIBLE * machine.size
+    if distance[row] > most:
+        raise InputError(
+            "the legs yield too far under these forces",
+            where=logged.readings.where(row),
+            found=f"{distance[row]:.2g} m at home, by what the mechanism file states",
+            expected=f"at most {most:.2g} m, a hundredth of the machine's size",
+            next_step="Write forces in N, of cranks and spools in N m, each stiffness in N/m or"
+            " N m/rad, and each axial_rigidity in N",
+            code="readings.forces",
+        )
+    return []
 
 
 def _trackers(
@@ -888,8 +926,7 @@ def _unmeasured(
 def _resolved_document(
     folder: Path,
     schema: SessionDocument,
-    table: CsvTable,
-    temperature: Array | None,
+    logged: JointTable,
     stations: tuple[Station, ...],
 ) -> dict[str, Any]:
     """Content of session.yaml as plain data, with columns, readings and image files written out."""
@@ -897,10 +934,13 @@ def _resolved_document(
     for kind in kinds_of(LinkKind).values():  # keep digests independent of unused kinds
         if document[kind.key] is None:
             del document[kind.key]
+    table = logged.readings
     document["joints"]["columns"] = list(table.columns)
     document["joints"]["readings"] = dict(zip(table.names, table.values.tolist(), strict=True))
-    if temperature is not None:
-        document["joints"]["temperatures"] = temperature.tolist()
+    if logged.temperature is not None:
+        document["joints"]["temperatures"] = logged.temperature.tolist()
+    if logged.forces is not None:
+        document["joints"]["forces"] = logged.forces.tolist()
     for station in stations:
         entry = document["stations"][station.entry]
         entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe

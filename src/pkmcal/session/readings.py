@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -42,16 +42,79 @@ TEMPERATURE_RANGE = (-100.0, 200.0)
 """Temperatures of machines, °C: beyond them they are in kelvin, or °C under kelvin."""
 
 
-def without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
-    """Table of the readings alone, and the temperatures (K,) of its last column, °C, if it has one;
+FORCE_HEAD = re.compile(r"(.+) (?:force|tension|torque)(?: ?[\[(](?:(k?N)|(N ?m))[\])])?")
+"""Head of a column of forces; its groups are the reading's column, and the unit."""
+
+
+@dataclass(frozen=True)
+class JointTable:
+    """Content of joints.csv.
+
+    readings : table of the joint readings alone.
+    forces : (K, m) on the readings, N, of cranks and spools N m; None without their columns.
+    temperature : (K,) °C, of the configurations; None without their column.
+    """
+
+    readings: CsvTable
+    forces: Array | None
+    temperature: Array | None
+
+
+def joint_table(whole: CsvTable, units: Sequence[str]) -> JointTable:
+    """Parts of a table of readings, of forces after them and of temperatures in its last column.
+
+    units : of the machine's readings, m or rad. Raises InputError for forces without their reading,
+    or in another unit, and for temperatures of no machine.
+    """
+    table, temperature = _without_temperature(whole)
+    heads = [FORCE_HEAD.fullmatch(column) for column in table.columns]
+    count = next((k for k, head in enumerate(heads) if head), len(heads))
+    readings = _first_columns(table, count)
+    if count == len(heads):
+        return JointTable(readings, None, temperature)
+    of = [head[1] if head else None for head in heads[count:]]
+    if of != list(readings.columns):
+        raise InputError(
+            "the columns of forces are not those of the readings",
+            where=f"{table.label}, line 1",
+            found=", ".join(table.columns[count:]),
+            expected=", ".join(f"{name} force" for name in readings.columns),
+            next_step="Write one force for each reading, in the order of the readings",
+            code="readings.forces",
+        )
+    factors = []
+    for column, head, unit in zip(table.columns[count:], heads[count:], units, strict=False):
+        if head and head[2 if unit == "rad" else 3]:
+            raise InputError(
+                "this force is in another unit than its reading needs",
+                where=f"{table.label}, line 1",
+                found=column,
+                expected="N m, since the reading is an angle" if unit == "rad"
+                else "N, since the reading is a length",
+                code="readings.force_unit",
+            )  # fmt: skip
+        factors.append(1e3 if head and head[2] == "kN" else 1.0)
+    factors += [1.0] * (len(of) - len(factors))  # the number of readings is checked later
+    return JointTable(readings, table.values[:, count:] * factors, temperature)
+
+
+def _first_columns(table: CsvTable, count: int) -> CsvTable:
+    """The table's first columns of numbers."""
+    return replace(
+        table,
+        columns=table.columns[:count],
+        values=table.values[:, :count],
+        units=table.units[:count],
+    )
+
+
+def _without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
+    """Table without temperatures, and the temperatures (K,) of its last column, °C, if it has one;
     those without a unit are as they are. Raises InputError for temperatures of no machine.
     """
     head = TEMPERATURE_HEAD.fullmatch(table.columns[-1]) if table.columns else None
     if head is None:
         return table, None
-    readings = replace(
-        table, columns=table.columns[:-1], values=table.values[:, :-1], units=table.units[:-1]
-    )
     temperature = table.values[:, -1] - (ICE_POINT if head[1] else 0.0)
     least, most = TEMPERATURE_RANGE
     if wrong := np.flatnonzero((temperature < least) | (temperature > most)).tolist():
@@ -63,7 +126,7 @@ def without_temperature(table: CsvTable) -> tuple[CsvTable, Array | None]:
             next_step="Head the column temperature [K], or temperature [°C]",
             code="readings.temperature_unit",
         )
-    return readings, temperature
+    return _first_columns(table, len(table.columns) - 1), temperature
 
 
 def rounding_step(readings: Array, unit: str, least: float) -> float | None:
@@ -370,7 +433,7 @@ def without_repeats(
 ) -> tuple[CsvTable, list[Finding]]:
     """Table with the rows of one pose replaced by their mean, and a warning about them.
 
-    readings : the table without its temperatures, of which poses are.
+    readings : the table of the readings alone, of which poses are.
 
     Used for self-calibration from readings alone. Model errors, such as a belt that sags or a hook
     that is no point, are the same in all repeats of a pose; counted as independent measurements,

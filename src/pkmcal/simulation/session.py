@@ -30,6 +30,7 @@ from pkmcal.simulation.truth import (
     HANDHELD_STATION_NAME,
     TRUTH_FILE,
     Settings,
+    TrueEffects,
     Truth,
     draw_truth,
     stream,
@@ -212,11 +213,16 @@ def _write_texts(
 
 
 def _readings_text(nominal: Machine, truth: Truth) -> str:
-    """joints.csv, with the temperatures where there are any."""
+    """joints.csv, with the forces and temperatures where there are any."""
     columns, values = nominal.joint_names, truth.readings
-    if truth.effects is not None and truth.effects.temperature is not None:
+    effects = truth.effects or TrueEffects()
+    if effects.forces is not None:
+        units = ("N" if unit == "m" else "N m" for unit in nominal.joint_units)
+        heads = (f"{n} force [{u}]" for n, u in zip(nominal.joint_names, units, strict=True))
+        columns, values = (*columns, *heads), np.column_stack([values, effects.forces])
+    if effects.temperature is not None:
         columns = (*columns, "temperature [°C]")
-        values = np.column_stack([values, truth.effects.temperature])
+        values = np.column_stack([values, effects.temperature])
     return csv_text(columns, truth.configurations, values)
 
 

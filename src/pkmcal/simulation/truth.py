@@ -23,7 +23,7 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
 from pkmcal.measurements.effects import FOCAL_SIGMA
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.disturbances import compliance, grown_readings, growth_of, sag
+from pkmcal.mechanisms.disturbances import grown_readings, growth_of, is_compliant, sag
 from pkmcal.mechanisms.document import STIFFNESS_TOLERANCE
 from pkmcal.mechanisms.kinematics import driven_towards
 from pkmcal.placement.configurations import draw_configurations, platform_unfolded, same_mode
@@ -92,6 +92,8 @@ class Settings:
         a number of ``stations`` is then ignored.
     warming : K, increase of the machine's temperature over the session. The readings contain the
         growth of drives and frame, the images show the machine as it is at first.
+    force : mean force on each reading, N, of cranks and spools N m. Each configuration's forces are
+        drawn between half and three halves of it, and logged.
     """
 
     stations: int | tuple[StationPose, ...] = default("simulate", "stations")
@@ -114,6 +116,7 @@ class Settings:
     handheld: bool = False
     breathing: float = FOCAL_SIGMA
     warming: float = default("simulate", "warming")
+    force: float = default("simulate", "force")
     requested: RequestedConfigurations | None = None
 
     @property
@@ -130,34 +133,38 @@ class TrueEffects:
 
     compliance : of the drives, relative to the stated one; None without a stated one. temperature :
     (K,) of the configurations. growth : (2,) of drives and frame, 1/K; None without temperatures.
+    forces : (K, m) on the readings, N or N m; None where they are not measured.
     """
 
     compliance: float | None = None
     temperature: Array | None = None
     growth: Array | None = None
+    forces: Array | None = None
 
     @classmethod
     def draw(
-        cls, nominal: Machine, warming: float, count: int, rng: np.random.Generator
+        cls, nominal: Machine, settings: Settings, count: int, rng: np.random.Generator
     ) -> TrueEffects:
         """Random effects by the stated stiffness and growth, by default the usual growth."""
-        compliant, temperature, growth = None, None, None
-        if compliance(nominal) is not None:
+        compliant, temperature, growth, forces = None, None, None, None
+        if is_compliant(nominal):
             tolerance = nominal.document.tolerance.stiffness or STIFFNESS_TOLERANCE
             # a compliance is positive
             compliant = float(np.exp(tolerance * rng.standard_normal()))
-        if warming:
+        if settings.warming:
             # as a body that is heated evenly, to 95 % of its last temperature
             warmer = np.expm1(-3 * np.linspace(0, 1, count)) / np.expm1(-3)
-            temperature = ROOM_TEMPERATURE + warming * warmer
+            temperature = ROOM_TEMPERATURE + settings.warming * warmer
             stated = growth_of(nominal, temperature)
             growth = [stated.drives, stated.frame] + stated.root @ rng.standard_normal(2)
-        return cls(compliant, temperature, growth)
+        if settings.force:
+            forces = settings.force * rng.uniform(0.5, 1.5, (count, nominal.n_joints))
+        return cls(compliant, temperature, growth, forces)
 
     def readings(self, machine: Machine, joints: Array, poses: Array) -> Array:
         """Readings (K, m) of drives that are at ``joints`` (K, m), at poses (K, 4, 4)."""
         if self.compliance is not None:
-            joints = joints - self.compliance * sag(machine, poses)
+            joints = joints - self.compliance * sag(machine, poses, self.forces)
         if self.temperature is None or self.growth is None:
             return joints
         warmer = self.temperature - growth_of(machine, self.temperature).temperature
@@ -270,7 +277,7 @@ def draw_truth(
             joints, rngs["board"],
         )  # fmt: skip
     noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
-    effects = TrueEffects.draw(nominal, settings.warming, len(joints), rngs["effects"])
+    effects = TrueEffects.draw(nominal, settings, len(joints), rngs["effects"])
     if settings.handheld:
         names = tuple(f"{HANDHELD_STATION_NAME}-{name}" for name in names)
     return Truth(
@@ -407,8 +414,8 @@ def truth_document(truth: Truth) -> dict[str, Any]:
     ``parameters`` are the true values by name; ``stations`` hold 4x4 ``T_camera_base``;
     ``configurations`` hold 4x4 ``T_base_platform`` and the exact readings ``joints``;
     ``images`` are pairs of names, with ``repeats`` images of each (one by default);
-    ``compliance``, ``temperature`` and ``growth`` are those of the readings. No estimator reads
-    this file.
+    ``compliance``, ``temperature``, ``growth`` and ``forces`` are those of the readings. No
+    estimator reads this file.
     """
     names = truth.machine.parameters.names
     return {
@@ -452,6 +459,8 @@ def _effects_document(effects: TrueEffects) -> dict[str, Any]:
         fields = {"temperature": effects.temperature.tolist(), "growth": effects.growth.tolist()}
     if effects.compliance is not None:
         fields["compliance"] = effects.compliance
+    if effects.forces is not None:
+        fields["forces"] = effects.forces.tolist()
     return fields
 
 
@@ -495,6 +504,9 @@ def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
         focal_scale=np.array(focal) if focal else None,
         effects=TrueEffects(
             data.get("compliance"),
-            *(np.array(data[key]) if key in data else None for key in ("temperature", "growth")),
+            *(
+                np.array(data[key]) if key in data else None
+                for key in ("temperature", "growth", "forces")
+            ),
         ),
     )

@@ -45,8 +45,10 @@ marker: {marker:<17} # the side of a marker
 dictionary: DICT_5X5_100
 tolerance: 0.1 %          # how well you measured: paper changes its size by as much
 """
-STARTER_SQUARE_SIDE, STARTER_SQUARE_CHOICES = 30, range(8, 31)
-"""Side of the board's squares, mm: the default and the values that can be chosen."""
+STARTER_SQUARES = (7, 5)
+STARTER_SQUARE_CHOICES = range(8, 31)
+"""Sides of the board's squares, mm, that can be chosen: from markers that a camera resolves to a
+sheet of A4."""
 ON_PLATFORM = """\
 
 board:
@@ -128,7 +130,7 @@ def session_texts(
         path.relative_to(SESSION_TEMPLATE_FOLDER).as_posix(): path.read_text("utf-8")
         for path in files
     }
-    turns = False
+    turns, platform = False, None
     if machine is not None:
         generated = isinstance(machine, NominalModel)
         model = machine.machine() if generated else load_mechanism(machine)
@@ -153,12 +155,14 @@ def session_texts(
         )
         texts["joints.csv"] = example_readings(model)
         turns = set(model.joint_units) == {"rad"}
+        if model.document.motion == "spatial":  # beyond its joints it meets the legs as it tilts
+            platform = 2 * float(np.linalg.norm(model.platform_centers()[:, :2], axis=-1).max())
     what = what or "legs"
     texts["session.yaml"] = _session_text(
         texts["session.yaml"], machine is None, turns, what, places
     )
     if what in ("board", "both"):
-        texts["board.yaml"] = board_text()
+        texts["board.yaml"] = board_text(platform)
     readme = texts.pop("images/front/README.txt")
     if what == "board":
         readme = readme[: readme.index(LEGS_TEXT)] + BOARD_TEXT
@@ -170,7 +174,18 @@ def session_texts(
     return texts
 
 
-def board_text(square: int = STARTER_SQUARE_SIDE) -> str:
+def board_text(diameter: float | None = None) -> str:
+    """Text of the example board.yaml.
+
+    diameter : of the circle in which the board's corners lie, m, within the sides that can be
+        chosen; None for the largest.
+    """
+    least, most = STARTER_SQUARE_CHOICES[0], STARTER_SQUARE_CHOICES[-1]
+    square = most if diameter is None else int(1e3 * diameter / np.hypot(*STARTER_SQUARES))
+    return _board_text(min(max(square, least), most))
+
+
+def _board_text(square: int) -> str:
     """Text of the example board.yaml. square : mm."""
     return STARTER_BOARD_TEXT.format(square=f"{square} mm", marker=f"{round(0.73 * square)} mm")
 
@@ -277,7 +292,7 @@ def _readings_of_machine(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
 def _starter_texts(name: str) -> tuple[str, ...]:
     """All texts that a file of a starter session can have."""
     if name == "board.yaml":
-        return tuple(board_text(square) for square in STARTER_SQUARE_CHOICES)
+        return tuple(_board_text(square) for square in STARTER_SQUARE_CHOICES)
     template = (SESSION_TEMPLATE_FOLDER / name).read_text("utf-8")
     if name == "mechanism.yaml":
         return template, *(read_text(path) for path in catalogue().values())
