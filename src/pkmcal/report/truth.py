@@ -8,7 +8,7 @@ from math import degrees
 from pkmcal.judge.against_truth import AgainstTruth
 from pkmcal.outcome import Outcome, Part, Row, Table
 from pkmcal.outcome.blocks.log_bar import Magnitude
-from pkmcal.wording import amount
+from pkmcal.wording import amount, percentage
 
 
 def with_truth(outcome: Outcome, comparison: AgainstTruth) -> Outcome:
@@ -50,6 +50,6 @@ def truth_sentence(comparison: AgainstTruth) -> str:
     """Sentence on the share of values within two standard deviations."""
     within, count = comparison.within, comparison.count
     return (
-        f"{within} of {count} values ({within / count:.0%}) lie within two"
+        f"{within} of {count} values ({percentage(within / count)}) lie within two"
         " of their standard deviations of the truth; 95 % should."
     )
