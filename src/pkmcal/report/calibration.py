@@ -194,7 +194,7 @@ def report_of(
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
         explanation=_joint_accuracy(estimate, centres) if len(edges) and c.verdict.usable else "",
-        comparison=_comparison(c, tool, holdout),
+        comparison=_comparison(c, tool, holdout) if c.verdict.usable else None,
         certificate=provenance.certificate(c, digest),
         partial=any(one.sure for one in c.model_errors),
         figures=calibration_cards(c, centres, tool),

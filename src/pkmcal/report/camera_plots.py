@@ -155,7 +155,7 @@ def views_plot(c: CameraCalibration) -> Plot | None:
 
 
 def models_plot(c: CameraCalibration) -> Plot | None:
-    """Error of each compared model on the views that it was fitted to, and on those left out; None
+    """Error of each compared model on the views that it was fitted to, and on those held out; None
     for a single model.
     """
     if len(c.compared) < 2:
@@ -164,7 +164,7 @@ def models_plot(c: CameraCalibration) -> Plot | None:
     for one in c.compared:
         chosen = (one.model, one.terms) == (c.camera.model, c.terms)
         name = ("✓ " if chosen else "") + " ".join((one.model, *one.terms))
-        tip = f"{name}: fitted {brief(one.rms)} px, left out {brief(one.left_out)} px"
+        tip = f"{name}: fitted {brief(one.rms)} px, held out {brief(one.left_out)} px"
         for points, value in ((fitted, one.rms), (left_out, one.left_out)):
             if np.isfinite(value) and value > 0:
                 points.append(Point(x=rounded(value), y=name, tip=tip))
@@ -174,11 +174,11 @@ def models_plot(c: CameraCalibration) -> Plot | None:
         name="models",
         title="Error of each model",
         caption="",
-        alt=f"Errors of {len(names)} models, fitted and left out; the table has the numbers",
+        alt=f"Errors of {len(names)} models, fitted and held out; the table has the numbers",
         x=log_axis("root mean square, px", (float(point.x) for point in points)),
         y=category_axis(names),
         marks=(
             DotsMark(name="fitted", colour="nominal", points=tuple(fitted)),
-            DotsMark(name="left out", colour="calibrated", points=tuple(left_out)),
+            DotsMark(name="held out", colour="calibrated", points=tuple(left_out)),
         ),
     )

@@ -5,6 +5,7 @@ import type { Image, Images } from "../document";
 import { h } from "../dom";
 import { legClass } from "../marks";
 import { imageSvg } from "../overlay";
+import { startTones } from "../tones";
 import type { Context } from "./index";
 
 export function images(block: Images, { selection, viewer }: Context): HTMLElement {
@@ -21,6 +22,8 @@ export function images(block: Images, { selection, viewer }: Context): HTMLEleme
   };
   const figure = (image: Image): HTMLElement => {
     const picture = imageSvg(image);
+    const background = picture.querySelector("image");
+    if (background) void startTones(background);
     picture.setAttribute("aria-hidden", "true"); // the button has the name, with the texts in the image
     const texts = block.size === "figure" ? [...picture.querySelectorAll("text")].map((text) => text.textContent) : [];
     const button = h("button", {
