@@ -6,7 +6,7 @@
 import "./inspector.css";
 import type { Image, Layer } from "./document";
 import { h, number } from "./dom";
-import { cameraPixel, imageSvg, replaceLayers, scaleMarks, uprightSize } from "./overlay";
+import { cameraPixel, hrefOf, imageSvg, replaceLayers, scaleMarks, uprightSize } from "./overlay";
 import type { Key } from "./selection";
 import { stripPanel } from "./strips";
 import { applyExponent, EXPONENTS, startExponent } from "./tones";
@@ -240,12 +240,12 @@ export class Inspector {
 
   /** Show the tones that were chosen, or with which the image starts. */
   private async brighten(): Promise<void> {
-    const image = this.picture?.querySelector("image");
-    if (!image) return;
-    const start = await startExponent(image);
-    if (!image.isConnected) return;
+    const background = this.picture?.querySelector("image");
+    if (!this.image || !background) return;
+    const start = await startExponent(hrefOf(this.image));
+    if (!background.isConnected) return;
     if (!this.gammaChosen) this.gamma.value = String(start);
-    applyExponent(image, this.gamma.valueAsNumber);
+    applyExponent(background, this.gamma.valueAsNumber);
   }
 
   /** Buttons of layers that have none yet. */

@@ -11,18 +11,22 @@ const SAMPLES = 64; // pixels across, of the copy that is measured
 export const EXPONENTS = { min: 0.2, max: 1.8, step: 0.05 };
 
 const exponents = new Map<string, Promise<number>>();
+const known = new Map<string, number>();
 const filters = svg("svg", { class: "tones", width: 0, height: 0, "aria-hidden": "true" });
 
-/** Show an image, of an element with `src` or `href`, with the exponent with which it starts. */
-export async function startTones(image: SVGElement | HTMLElement): Promise<void> {
-  applyExponent(image, await startExponent(image));
+/** Show an image with the exponent with which it starts: at once if that is known, as on paper. */
+export async function startTones(image: SVGElement | HTMLElement, href: string): Promise<void> {
+  applyExponent(image, known.get(href) ?? (await startExponent(href)));
 }
 
 /** Exponent with which an image starts; 1 leaves it as it is. */
-export function startExponent(image: SVGElement | HTMLElement): Promise<number> {
-  const href = image.getAttribute("href") ?? image.getAttribute("src") ?? "";
+export function startExponent(href: string): Promise<number> {
   let exponent = exponents.get(href);
-  if (!exponent) exponents.set(href, (exponent = measured(href).catch(() => 1)));
+  if (!exponent) {
+    exponent = measured(href).catch(() => 1);
+    exponents.set(href, exponent);
+    void exponent.then((value) => known.set(href, value));
+  }
   return exponent;
 }
 

@@ -26,7 +26,8 @@ def with_truth(outcome: Outcome, comparison: AgainstTruth) -> Outcome:
         true = Magnitude(
             label="True error", value=error * 1e3, text=amount(error, "m"), role="test"
         )
-        bar = bar.model_copy(update={"magnitudes": (*bar.magnitudes, true)})
+        note = f"{bar.note} True error: distance of the calibrated machine from the simulated one."
+        bar = bar.model_copy(update={"magnitudes": (*bar.magnitudes, true), "note": note})
     return replace(outcome, comparison=bar, parts=(part, *outcome.parts))
 
 
@@ -42,7 +43,7 @@ def truth_table(comparison: AgainstTruth) -> Table:
     ):
         times = f"{old / new:.0f} times nearer" if new > 0 else ""
         rows.append(Row(what, (f"{old:.2f}{unit}", f"{new:.3f}{unit}", times)))
-    columns = ("Against the truth", "Nominal model", "Calibrated", "")
+    columns = ("Against the truth", "Nominal model", "Calibrated", "Gain")
     return Table("", columns, tuple(rows), brief=False)
 
 
