@@ -265,7 +265,7 @@ def _row(count: int, of_a_kit: bool, noise: float, n: int, wrong: float) -> None
     inside = np.mean(np.abs(t[:, 1]) < 1.96)
     print(
         f"    error over stated deviation: flat {root(t[:, 0]):.2f}, size {root(t[:, 1]):.2f}"
-        f" ({inside:.0%} within 1.96); accepted {np.mean(t[:, 2]):.0%}",
+        f" ({100 * inside:.0f} % within 1.96); accepted {100 * np.mean(t[:, 2]):.0f} %",
         flush=True,
     )
 

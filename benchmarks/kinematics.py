@@ -68,7 +68,7 @@ def measure(name: str, count: int) -> bool:
         f"{name:14}  {len(poses) / batch[0]:9,.0f} poses/s ({len(poses) / batch[1]:9,.0f} by the"
         f" clock)  {single[0] * 1e6:5.0f} us a call ({single[1] * 1e6:5.0f})"
         f"  {followed[0] / 2 * 1e6:5.0f} us followed ({followed[1] / 2 * 1e6:5.0f})"
-        f"  {len(poses) / count:4.0%} of readings close  single differs {off:.0e}"
+        f"  {100 * len(poses) / count:3.0f} % of readings close  single differs {off:.0e}"
     )
     return max(off, apart) < AGREE
 

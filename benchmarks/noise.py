@@ -70,7 +70,7 @@ def main() -> None:
             )
         off, sigma, z = (1e3 * np.sqrt(np.mean(x)) for x in (off, sigma, z))
         print(
-            f"{true_noise * 1e6:7g} {stated * 1e6:7g}    {np.mean(rows):5.0%}"
+            f"{true_noise * 1e6:7g} {stated * 1e6:7g}    {100 * np.mean(rows):4.0f} %"
             f" {np.median(factors):8.3g}"
             f"  {off:8.4f} {sigma:8.4f} {z / 1e3:6.2f}",
             flush=True,

@@ -161,7 +161,9 @@ def main() -> None:
             print(f"{n:3d} points: {dict(of_points)}", flush=True)
             every += of_points
     total = sum(every.values())
-    shares = ", ".join(f"{kind} {number} ({number / total:.0%})" for kind, number in every.items())
+    shares = ", ".join(
+        f"{kind} {number} ({100 * number / total:.0f} %)" for kind, number in every.items()
+    )
     print(f"{total} printers: {shares}")
 
 

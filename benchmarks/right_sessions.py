@@ -367,7 +367,7 @@ def main() -> None:
             worst = np.nanmax(z) if np.isfinite(z).any() else float("nan")
             print(f"{kind:26}{len(results):4d}"
                   + "".join(f"{n:10d}" for n in (*visible.sum(axis=0), visible.any(axis=1).sum()))
-                  + f"{holds.mean():10.0%}{holds[both].sum():6d}/{both.sum():<3d}"
+                  + f"{100 * holds.mean():8.0f} %{holds[both].sum():6d}/{both.sum():<3d}"
                   f"{z_rms:7.2f}{worst:7.2f}{np.mean([one.seconds for one in results]):6.1f}",
                   flush=True)  # fmt: skip
             for seed, one in zip(seeds, results, strict=True):
@@ -376,8 +376,8 @@ def main() -> None:
                          for text in one.findings.get(name, ())]  # fmt: skip
     n = len(kinds) * len(seeds)
     print(f"\n{every} of {n} sessions have a finding; intervals hold the truth in"
-          f" {np.mean(within):.1%}, those with two ends in {np.mean(two_ended or [np.nan]):.1%}"
-          f" of {len(two_ended)}\n")  # fmt: skip
+          f" {100 * np.mean(within):.1f} %, those with two ends in"
+          f" {100 * np.mean(two_ended or [np.nan]):.1f} % of {len(two_ended)}\n")  # fmt: skip
     print("\n".join(words))
 
 

@@ -86,7 +86,7 @@ def test_black_images_of_nothing(session):
     changed(session, lambda picture: picture * 0, "station3")
     check = check_session(session)
     assert check.exit_code == 2
-    assert "station3: 100% of the pictures are black" in texts(check, Level.DOUBTFUL)[0]
+    assert "station3: 100 % of the pictures are black" in texts(check, Level.DOUBTFUL)[0]
     assert "not localized in the images of station3" in texts(check, Level.WRONG)[0]
     assert [station.recognised for station in check.stations] == [True, False]
 
@@ -176,9 +176,9 @@ def test_a_cards_unit_is_what_was_searched(handheld, counted):
     ("station", "message"),
     [
         (GOOD, None),
-        (replace(GOOD, saturated=0.3), "30% of the legs are overexposed"),
-        (replace(GOOD, saturated=0.3, recognised=False), "30% of the images are overexposed"),
-        (replace(GOOD, black=0.6), "60% of the legs are black"),
+        (replace(GOOD, saturated=0.3), "30 % of the legs are overexposed"),
+        (replace(GOOD, saturated=0.3, recognised=False), "30 % of the images are overexposed"),
+        (replace(GOOD, black=0.6), "60 % of the legs are black"),
         (replace(GOOD, blur=1.9), "blurred over 1.9 px"),
         (replace(GOOD, blur=float("nan")), None),
         (replace(GOOD, legs=2.5), "Only 2.5 of 6 legs"),
@@ -197,7 +197,7 @@ def test_crowded_and_few_configurations(demo):
     )
     results = joint_findings(replace(session, configurations=("a", "b")), joints)
     assert [finding.level for finding in results] == [Level.NOTE] * 2
-    assert results[0].text.startswith("leg1 used little of the range (down to 7%)")
+    assert results[0].text.startswith("leg1 used little of the range (down to 7 %)")
     assert results[1].text.startswith("There are only 2 configurations")
 
 

@@ -202,7 +202,7 @@ def test_no_forecast_of_images_without_edges(checked_session):
 
 @pytest.mark.parametrize(
     ("visible", "checked_session", "why"),
-    [(0.3, 0.9, "70% hidden from front"), (0.9, 0.4, "60% of its edges lost at front")],
+    [(0.3, 0.9, "70 % hidden from front"), (0.9, 0.4, "60 % of its edges lost at front")],
 )
 def test_an_uninformative_leg_is_named_with_its_reason(visible, checked_session, why):
     legs = [LegForecast("front", j, 0.9, 0.95, 0.1, 0.19, 0.1) for j in range(1, 6)]
@@ -210,7 +210,7 @@ def test_an_uninformative_leg_is_named_with_its_reason(visible, checked_session,
     values = Forecast(15, 2e-4, 1e-3, 0.0, 0.03, float("nan"), tuple(legs))
     part = words.forecast_part(values)
     assert (
-        part.terminal_text[1] == f"Leg 6 contributes little, 2% of the edges' information: {why}."
+        part.terminal_text[1] == f"Leg 6 contributes little, 2 % of the edges' information: {why}."
     )
     marks = [row.mark for row in part.tables[0].rows]
     assert marks == ["good"] * 5 + [Level.NOTE]

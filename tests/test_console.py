@@ -140,9 +140,9 @@ def test_a_long_step_is_reported_in_plain_lines(monkeypatch, capsys):
         progress.report("Finding the legs: 3 of 9 images", 0.35)
         heard.written.clear()
         assert heard.written.wait(60)
-    line = r"(Starting|Finding the legs: 3 of 9 images) \(\d+%, \d+ s\)"
+    line = r"(Starting|Finding the legs: 3 of 9 images) \(\d+ %, \d+ s\)"
     assert all(re.fullmatch(line, x) for x in heard.text.splitlines())
-    assert "Finding the legs: 3 of 9 images (35%, 0 s)" in heard.text
+    assert "Finding the legs: 3 of 9 images (35 %, 0 s)" in heard.text
     assert capsys.readouterr().out == ""
 
 

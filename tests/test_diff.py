@@ -184,7 +184,7 @@ def test_shared_images_are_counted(saved):
     assert value.verdict.headline == (
         "The two are the same: no number differs by more than rounding."
     )
-    assert any("100% of what" in text for text in value.assumed)
+    assert any("100 % of what" in text for text in value.assumed)
 
 
 def test_images_are_counted_however_they_are_grouped(saved):

@@ -164,7 +164,7 @@ def test_violations_have_kinds_for_files():
     [
         ("{x:.2g mm} of {n}", {"x": 0.00123, "n": 3}, "1.2 mm of 3"),
         ("{x:amount m}, {y+unit:amount}", {"x": -7e-5, "y": 0.1, "unit": "rad"}, "0.070 mm, 5.7°"),
-        ("{x:size .1%} {x:sign more|less}", {"x": -0.0123}, "1.2% less"),
+        ("{x:size .1%} {x:sign more|less}", {"x": -0.0123}, "1.2 % less"),
         ("{x+s:ratio}", {"x": 0.0123, "s": 0.001}, "1.23 ± 0.10 %"),
         ("{legs:count leg} {legs:one is|are}", {"legs": [1, 2]}, "2 legs are"),
         ("{names:listed 3}", {"names": ["a", "b", "c", "d"]}, "a, b and 2 more"),

@@ -56,7 +56,7 @@ def test_a_proper_refusal_has_no_faults():
     assert faults() == ()
     assert faults(0, err="") == ()
     # progress of a long command, with the time that it still takes
-    for line in ("Rendering (0%, 10 s)", "Testing for changes (86%, 10 s, 0:01 left)"):
+    for line in ("Rendering (0 %, 10 s)", "Testing for changes (86 %, 10 s, 0:01 left)"):
         assert faults(0, err=f"{line}\n") == ()
         assert faults(err=f"{line}\n{GOOD}") == ()
 

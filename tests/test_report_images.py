@@ -102,7 +102,7 @@ def test_the_fitted_line_lies_on_the_edge_in_the_strip(case):
     curves = pictures.edge_curves(c, mine, 0)
     for k in range(0, len(mine), 3):
         tube = image_of_edge(curves[k], lines.normal[k].mean(axis=0), size)
-        (strip,), webp = strips_of_image(c, tube, mine[k : k + 1], lines.select(mine == mine[k]))
+        (strip,), webp = strips_of_image(tube, lines.select(mine == mine[k]))
         level = decoded(webp)
         assert level.shape == (STRIP_ROWS, strip.length)
         at = np.linspace(0, strip.length - 1, len(strip.offset))
@@ -188,13 +188,23 @@ def test_the_page_holds_each_image_once_with_its_strips(page, case):
         assert len(layers["joints"]) == len(layers["nominal"]) == 12
         with_strip = [line["strip"] for line in layers["edges"] if "strip" in line]
         assert with_strip == list(range(len(image["strips"])))
+        assert decoded(image["strip_webp"]).shape == (
+            len(image["strips"]) * STRIP_ROWS, max(one["length"] for one in image["strips"]),
+        )  # fmt: skip
+        assert image["strip_rows"] == STRIP_ROWS
         for line in layers["edges"]:
             if "strip" in line:
-                name = line["tip"].partition(":")[0]
-                assert image["strips"][line["strip"]]["title"].startswith(f"{name}: ")
+                offset = image["strips"][line["strip"]]["offset"]
+                assert stated_offset(line["tip"]) == offset[len(offset) // 2]
     assert any(line.get("dashed") for one in images for line in edges_of_image(one))
     # keys are those of the selection
     assert images[0]["key"] == "image:" + images[0]["title"].replace(" / ", "/")
+
+
+def stated_offset(tip: str) -> float:
+    """Displacement (px) in the tooltip of an edge."""
+    text = tip.partition(": ")[2].partition(" px")[0].partition(" ±")[0]
+    return float(text.replace("\N{MINUS SIGN}", "-"))
 
 
 def edges_of_image(image):
@@ -259,10 +269,10 @@ def test_residual_arrows_lead_from_their_edges_to_those_of_the_machine(case):
             distance = np.abs(np.sum(off * normal, axis=1))
             k = int(np.where(np.abs(share - 0.5) < 0.5, distance, np.inf).argmin())
             assert distance[k] < 0.17  # lines are straight to 0.1 px, and tails are rounded
-            stated = lines[n[k]].tip.split(": ")[1].split(" px")[0].replace("\N{MINUS SIGN}", "-")
+            stated = stated_offset(lines[n[k]].tip)
             across = displacement @ normal[k]
             assert abs(np.hypot(*displacement) - abs(across)) < 2e-3
-            pairs.append((abs(across), abs(float(stated))))
+            pairs.append((abs(across), abs(stated)))
     assert len(pairs) > 100
     drawn, stated = np.array(pairs).T
     np.testing.assert_allclose(drawn, stated, atol=0.02)
@@ -316,7 +326,11 @@ INSPECTED = """
     const gamma = $(".inspector-gamma input");
     gamma.value = 0.45;
     gamma.dispatchEvent(new Event("input"));
-    const exponent = () => picture().querySelector("feFuncG").getAttribute("exponent");
+    const exponent = () => {
+      const [filter] = picture().querySelector("image").style.filter.match(/#[\\w-]+/);
+      return $(`${filter} feFuncG`).getAttribute("exponent");
+    };
+    await wait(50);
     tell.gamma = exponent();
     key("x");
     key("x");
@@ -328,6 +342,7 @@ INSPECTED = """
     tell.fine = $(".strip-image").viewBox.baseVal.height;
     key("ArrowRight");
     tell.second = caption();
+    await wait(50);
     tell.again = [hidden("edges"), exponent(), $(".strip")].join();
     await wait(100);
     tell.fitted = JSON.stringify(box());
@@ -399,7 +414,8 @@ def test_images_are_inspected(page, tmp_path):
     # the second edge's strip, eight screen pixels for one across it
     (block,) = page_blocks(page_document(page), "images", "photographs")
     title, height = root["strip"].split("|")
-    assert title == block["images"][0]["strips"][1]["title"]
+    lines = edges_of_image(block["images"][0])
+    assert title.replace("&nbsp;", " ") == next(x["tip"] for x in lines if x.get("strip") == 1)
     assert float(height) == 8 * STRIP_ROWS
     assert (float(root["rows"]), float(root["fine"])) == (STRIP_ROWS, STRIP_ROWS / 8)
     key, led = root["led"].split("|")

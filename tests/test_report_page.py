@@ -139,7 +139,7 @@ def test_cards_are_marked_by_the_verdict(case, finding, question):
     document = case_document(*vars(case).values(), Verdict(usable, "Not so fine.", (finding,)))
     cards = {card["question"]: card for card in document["cards"]}
     assert cards[question]["mark"] == finding.level
-    assert cards[DATA_QUESTION]["limit"].endswith(f"{VERDICT.too_many_rejected:.0%}")
+    assert cards[DATA_QUESTION]["limit"].endswith(f"{100 * VERDICT.too_many_rejected:.0f} %")
 
 
 def test_sections_of_a_refused_result_are_void(case):
@@ -410,8 +410,8 @@ def test_sections_lead_from_the_contents(page):
 @pytest.mark.parametrize(
     ("probability", "text"),
     [
-        (0.975, "98%"),
-        (0.12, "12%"),
+        (0.975, "98 %"),
+        (0.12, "12 %"),
         (0.05, "1 in 20"),
         (1 / 254, "1 in 250"),
         (1 / 25_400, "1 in 25\N{NARROW NO-BREAK SPACE}000"),

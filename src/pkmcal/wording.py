@@ -132,7 +132,7 @@ def date_text(moment: datetime) -> str:
 
 
 class Chance(str):
-    """Text of a probability: ``34%``, ``1 in 250``, ``< 1 in 10⁶``; a dash for NaN.
+    """Text of a probability: ``34 %``, ``1 in 250``, ``< 1 in 10⁶``; a dash for NaN.
 
     value : the probability.
     """
@@ -142,7 +142,7 @@ class Chance(str):
         if not math.isfinite(probability):
             text = "–"
         elif probability >= 0.1:
-            text = f"{probability:.0%}"
+            text = percentage(probability)
         elif probability >= 1e-6:
             often = 1 / probability
             places = max(0, math.floor(math.log10(often)) - 1)  # two significant digits
@@ -157,6 +157,11 @@ class Chance(str):
     def __getnewargs__(self) -> tuple[float]:  # type: ignore[override]
         """Argument with which a copy is made."""
         return (self.value,)
+
+
+def percentage(share: float, decimals: int = 0) -> str:
+    """Share in per cent, ``34 %``; a dash for NaN."""
+    return f"{100 * share:.{decimals}f} %" if math.isfinite(share) else "–"
 
 
 def percent(share: float) -> str:

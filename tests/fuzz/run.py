@@ -38,7 +38,7 @@ INVISIBLE = ("Cc", "Cf", "Cs", "Zl", "Zp")
 ODD_FOLDER_NAME = os.fsdecode(b"a\xff\x1b[31m\n# \xe2\x80\xaeb")
 ODD_FOLDERS_EACH = 5
 """One case of so many is in a folder with such a name."""
-PROGRESS = re.compile(r"[A-Z].* \(\d+%, \d+ s(, [\d:]+ left)?\)")
+PROGRESS = re.compile(r"[A-Z].* \(\d+ %, \d+ s(, [\d:]+ left)?\)")
 """Progress output of a long command without a terminal."""
 PLACE = re.compile(
     r"\bline \d+|\bcolumn |\bstation\d|\bat station |camera [\w/.]+:"

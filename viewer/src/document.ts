@@ -534,6 +534,7 @@ export interface Hint {
  * url : of the image beside a page that is served, in place of ``webp``.
  * overlays : of which a viewer shows one at a time.
  * strip_webp : the strips one below the other, base64; empty without any.
+ * strip_rows : rows of each strip.
  */
 export interface Image {
   title: string;
@@ -547,6 +548,7 @@ export interface Image {
   url: string;
   overlays: Overlay[];
   strip_webp: string;
+  strip_rows: number;
   strips: Strip[];
 }
 /**
@@ -605,19 +607,14 @@ export interface Ring {
 /**
  * Image along an edge, sampled in native pixels across the predicted edge and along it.
  *
- * title : name of the edge, offset of the fitted line from the prediction, its standard deviation.
- * row : first row of the strip in the image's ``strip_webp``.
- * length, across : columns along the edge, from A to B, and rows across it, outward first; the
- *     prediction is in the middle row.
+ * length : columns along the edge, from A to B. Rows are across it, outward first; the prediction
+ *     is in the middle row.
  * offset : offset of the fitted line from the prediction, px outward, at evenly spaced positions
  *     from the middle of the first column to that of the last.
  * sigma : its standard deviation there, px.
  */
 export interface Strip {
-  title: string;
-  row: number;
   length: number;
-  across: number;
   offset: number[];
   sigma: number[];
 }
@@ -970,7 +967,7 @@ export interface ReportDocument {
 /**
  * Judgement at the top of a report.
  *
- * tone : good, partial (usable, with exceptions), bad, or neutral (nothing is judged).
+ * tone : good, partial (with exceptions or doubts), bad, or neutral (nothing is judged).
  * stamp : one to three words.
  * explanation : line below the headline.
  * reasons : points below both.

@@ -2,6 +2,11 @@
 
 type Attributes = Record<string, string | number | boolean | ((event: Event) => void)>;
 type Child = Node | string;
+const WITHIN_QUANTITY = /(?<=\d) (?=(?:±|%|σ|mm|px|µm|m|mrad|rad|s)(?![\p{L}\p{N}]))|(?<=±) (?=\d)/gu;
+
+/** Children with their numbers and units on one line. */
+const unbroken = (children: Child[]): Child[] =>
+  children.map((one) => (typeof one === "string" ? one.replace(WITHIN_QUANTITY, "\u00a0") : one));
 
 /** Element with attributes, listeners (`onclick`, …) and children. */
 export function h<K extends keyof HTMLElementTagNameMap>(
@@ -15,7 +20,7 @@ export function h<K extends keyof HTMLElementTagNameMap>(
     else if (value === true) element.setAttribute(name, "");
     else if (value !== false) element.setAttribute(name, String(value));
   }
-  element.append(...children);
+  element.append(...unbroken(children));
   return element;
 }
 

@@ -5,10 +5,11 @@
 
 import "./inspector.css";
 import type { Image, Layer } from "./document";
-import { h, number, svg } from "./dom";
-import { cameraPixel, imageSvg, replaceLayers, scaleMarks, uprightSize } from "./overlay";
+import { h, number } from "./dom";
+import { cameraPixel, hrefOf, imageSvg, replaceLayers, scaleMarks, uprightSize } from "./overlay";
 import type { Key } from "./selection";
 import { stripPanel } from "./strips";
+import { applyExponent, EXPONENTS, startExponent } from "./tones";
 
 const LARGEST_PIXEL = 80; // screen pixels for one of the image
 const SMOOTH_BELOW = 3; // likewise; above it pixels have edges
@@ -48,13 +49,13 @@ export class Inspector {
   private readonly choices = h("span", { class: "inspector-choices" });
   private readonly layers = h("span", { class: "inspector-choices" });
   private readonly gamma: HTMLInputElement;
+  private gammaChosen = false; // by the reader, for all images
   private readonly where = h("span", { class: "inspector-where" });
   private image: Image | null = null;
   private picture: SVGSVGElement | null = null;
   private overlay = 0;
   /** Index of the strip that is shown, -1 for none. */
   private chosen = -1;
-  private curve: SVGElement[] = [];
   private readonly off = new Set<LayerName>();
   private dragging = false; // by the tool
   private readonly pointers = new Map<number, { x: number; y: number }>();
@@ -73,8 +74,11 @@ export class Inspector {
     private readonly tool: DragTool | null = null,
   ) {
     this.gamma = h("input", {
-      type: "range", min: 0.2, max: 1.8, step: 0.05, value: 1, "aria-label": "Brightness of the dark parts",
-      oninput: () => this.brighten(),
+      type: "range", ...EXPONENTS, value: 1, "aria-label": "Brightness of the dark parts",
+      oninput: () => {
+        this.gammaChosen = true;
+        void this.brighten();
+      },
     });
     const button = (text: string, label: string, act: () => void): HTMLElement =>
       h("button", { type: "button", "aria-label": label, title: label, onclick: act }, text);
@@ -103,7 +107,7 @@ export class Inspector {
     this.listen();
   }
 
-  /** Show an image; choice of the overlay, layers and brightness stay as they were. */
+  /** Show an image; choice of the overlay, layers and a chosen brightness stay as they were. */
   show(image: Image): void {
     this.image = image;
     this.size = { x: -0.5, y: -0.5, ...uprightSize(image) };
@@ -130,7 +134,6 @@ export class Inspector {
     this.picture = picture;
     picture.setAttribute("preserveAspectRatio", "xMidYMid meet");
     this.host.replaceChildren(picture);
-    this.addCurve(picture);
     this.strips.hidden = !image.strips.length;
     this.choices.replaceChildren(...(image.overlays.length < 2 ? [] : image.overlays.map(({ title }, k) =>
       h("button", {
@@ -141,7 +144,7 @@ export class Inspector {
       }, title))));
     this.layers.replaceChildren();
     this.addLayers(image.overlays[overlay]?.layers ?? []);
-    this.brighten();
+    void this.brighten();
     this.markStrip();
     this.keepFocus();
   }
@@ -235,22 +238,14 @@ export class Inspector {
     this.where.textContent = `${number(this.view.scale, this.view.scale < 10 ? 1 : 0)}×`;
   }
 
-  /** Filter of the image's tones, inside the picture itself. */
-  private addCurve(picture: SVGSVGElement): void {
-    const image = picture.querySelector("image");
-    if (!image) return;
-    this.curve = (["feFuncR", "feFuncG", "feFuncB"] as const).map((channel) => svg(channel, { type: "gamma" }));
-    picture.prepend(svg("filter", { id: "inspector-tones", "color-interpolation-filters": "sRGB" },
-      svg("feComponentTransfer", {}, ...this.curve)));
-  }
-
-  private brighten(): void {
-    const exponent = this.gamma.value;
-    for (const one of this.curve) one.setAttribute("exponent", exponent);
-    // without the filter zooming is faster
-    const image = this.picture?.querySelector("image");
-    if (Number(exponent) === 1) image?.removeAttribute("filter");
-    else image?.setAttribute("filter", "url(#inspector-tones)");
+  /** Show the tones that were chosen, or with which the image starts. */
+  private async brighten(): Promise<void> {
+    const background = this.picture?.querySelector("image");
+    if (!this.image || !background) return;
+    const start = await startExponent(hrefOf(this.image));
+    if (!background.isConnected) return;
+    if (!this.gammaChosen) this.gamma.value = String(start);
+    applyExponent(background, this.gamma.valueAsNumber);
   }
 
   /** Buttons of layers that have none yet. */

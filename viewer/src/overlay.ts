@@ -31,11 +31,14 @@ export function cameraPixel(image: Image, x: number, y: number): [number, number
   return [a * (x - e) + b * (y - f), c * (x - e) + d * (y - f)]; // a rotation: transposed
 }
 
+/** Address of an image; empty if it could not be read. */
+export const hrefOf = (image: Image): string => image.url || (image.webp && toBlobUrl(image.webp));
+
 /** Image with one of its overlays, none for an index without one. */
 export function imageSvg(image: Image, overlay = 0): SVGSVGElement {
   const { width, height } = uprightSize(image);
   const frame = { x: -0.5, y: -0.5, width: image.width, height: image.height };
-  const href = image.url || (image.webp && toBlobUrl(image.webp));
+  const href = hrefOf(image);
   const background = href
     ? svg("image", { ...frame, preserveAspectRatio: "none", href })
     : svg("rect", { ...frame, class: "absent" });

@@ -4,24 +4,24 @@
  */
 
 import "./strips.css";
-import type { Image, Strip } from "./document";
+import type { Image, Layer } from "./document";
 import { h, svg } from "./dom";
 import { toBlobUrl } from "./image_data";
 
 const ENLARGEMENTS = [8, 64]; // screen pixels for one across the edge
 
 export function stripPanel(image: Image, index: number): HTMLElement {
-  const strip = image.strips[index];
+  const title = tipOf(image, index);
   const host = h("div", { class: "strip-host" });
   const buttons = ENLARGEMENTS.map((factor) =>
     h("button", { type: "button", onclick: () => show(factor) }, `${factor}×`));
   const show = (factor: number): void => {
-    host.replaceChildren(stripSvg(image, strip, factor));
+    host.replaceChildren(stripSvg(image, index, title, factor));
     buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(ENLARGEMENTS[k] === factor)));
   };
   show(ENLARGEMENTS[0]);
   return h("div", { class: "strip" },
-    h("p", { class: "strip-title" }, strip.title, " ", ...buttons), host,
+    h("p", { class: "strip-title" }, title, " ", ...buttons), host,
     h("p", { class: "strip-key" },
       h("span", { class: "fitted" }), "fitted line ± σ ", h("span", { class: "predicted" }),
       "calibrated machine · outward is up; from the base's end at the left to the platform's. The border in the"
@@ -29,8 +29,15 @@ export function stripPanel(image: Image, index: number): HTMLElement {
         + " differs along the tube: that is no error of the fit."));
 }
 
-function stripSvg(image: Image, strip: Strip, factor: number): SVGElement {
-  const { length, across, row, offset, sigma } = strip;
+/** Explanation of the edge with a strip. */
+function tipOf(image: Image, index: number): string {
+  const shapes = image.overlays.flatMap((one) => one.layers).flatMap((layer) => layer.shapes as Layer["shapes"][number][]);
+  return shapes.find((one) => one.shape === "polyline" && one.strip === index)?.tip ?? "";
+}
+
+function stripSvg(image: Image, index: number, title: string, factor: number): SVGElement {
+  const { length, offset, sigma } = image.strips[index];
+  const across = image.strip_rows;
   const rows = across * (ENLARGEMENTS[0] / factor);
   const middle = (across - 1) / 2;
   const along = (k: number): number => (k * (length - 1)) / Math.max(offset.length - 1, 1);
@@ -39,14 +46,14 @@ function stripSvg(image: Image, strip: Strip, factor: number): SVGElement {
   const lower = offset.map((one, k) => one - sigma[k]);
   const sprite = {
     width: Math.max(...image.strips.map((one) => one.length)),
-    height: Math.max(...image.strips.map((one) => one.row + one.across)),
+    height: image.strips.length * across,
   };
   const picture = svg("svg", {
-    class: "strip-image", preserveAspectRatio: "none", role: "img", "aria-label": strip.title,
+    class: "strip-image", preserveAspectRatio: "none", role: "img", "aria-label": title,
     viewBox: `-0.5 ${middle - rows / 2} ${length} ${rows}`,
   },
     svg("image", {
-      x: -0.5, y: -row - 0.5, ...sprite, preserveAspectRatio: "none", href: toBlobUrl(image.strip_webp),
+      x: -0.5, y: -index * across - 0.5, ...sprite, preserveAspectRatio: "none", href: toBlobUrl(image.strip_webp),
     }),
     svg("path", { class: "predicted", d: `M${path(offset.map(() => 0))}` }),
     svg("path", { class: "band", d: `M${path(upper)}L${path(lower).split("L").reverse().join("L")}Z` }),

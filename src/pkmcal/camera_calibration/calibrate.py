@@ -58,7 +58,7 @@ from pkmcal.levels import (
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.solver.kernels import INLIER_WEIGHT
-from pkmcal.wording import listed
+from pkmcal.wording import listed, percentage
 
 
 @dataclass(frozen=True)
@@ -521,8 +521,8 @@ def check_corners(
         return
     raise ResultError(
         "too many of the board's corners do not fit the rest",
-        found=f"{rejected:.0%} of them ({fit.camera.model} fits best)",
-        expected=f"{options.most_lost:.0%} at most",
+        found=f"{percentage(rejected)} of them ({fit.camera.model} fits best)",
+        expected=f"{percentage(options.most_lost)} at most",
         next_step="Look for a bent board, a wrong board file, motion blur, or a zoom or focus that"
         " moved",
         code="lens.too_many_rejected",

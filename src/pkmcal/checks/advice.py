@@ -21,7 +21,7 @@ from pkmcal.outcome import Figure, Level, Part, Row, Table
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.first import EdgesOf
-from pkmcal.wording import brief, count, listed, named
+from pkmcal.wording import brief, count, listed, named, percentage
 
 INFORMATION_LOST_SHARE = CAUSE_SHARE
 """Share of the information that is lost with that factor."""
@@ -228,9 +228,9 @@ def forecast_part(forecast: Forecast) -> Part:
             Row(
                 str(j),
                 (
-                    *(_percent(by[s, j].tells) for s in stations),
-                    _percent(total[j]),
-                    _percent(sum(by[s, j].variance for s in stations)),
+                    *(percentage(by[s, j].tells) for s in stations),
+                    percentage(total[j]),
+                    percentage(sum(by[s, j].variance for s in stations)),
                 ),
                 mark=Level.NOTE if j in poor else "good",
             )
@@ -239,7 +239,7 @@ def forecast_part(forecast: Forecast) -> Part:
         together = [sum(by[s, j].tells for j in numbers) for s in stations]
         variance = sum(leg.variance for leg in forecast.legs)
         all_ = Row(
-            "all", tuple(_percent(x) for x in (*together, sum(together), variance)), mark="good"
+            "all", tuple(percentage(x) for x in (*together, sum(together), variance)), mark="good"
         )
         share = LEG_COLUMNS["Information"]
         head = ("Leg", *stations, "All stations", "Tool variance")
@@ -269,20 +269,20 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
         f"{subject} would determine the platform's position to {brief(forecast.position * 1e3)} mm"
         f" and its orientation to {brief(math.degrees(forecast.orientation))}° (standard deviations"
         f" at given readings{source}). Of its variance"
-        f" {sum(leg.variance for leg in forecast.legs):.0%} comes from the edges,"
-        f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from the priors"
-        " of the nominal model and of shading."
+        f" {percentage(sum(leg.variance for leg in forecast.legs))} comes from the edges,"
+        f" {percentage(forecast.readings)} from the readings, {percentage(forecast.drawing)} from"
+        " the priors of the nominal model and of shading."
     ]
     for j in poor:
         mine = [leg for leg in forecast.legs if leg.leg == j]
         why: list[str] = []
         for leg in mine:
             if leg.seen < 1 - INFORMATION_LOST_SHARE:
-                why.append(f"{1 - leg.seen:.0%} hidden from {leg.station}")
+                why.append(f"{percentage(1 - leg.seen)} hidden from {leg.station}")
             elif leg.found < 1 - INFORMATION_LOST_SHARE:
-                why.append(f"{1 - leg.found:.0%} of its edges lost at {leg.station}")
+                why.append(f"{percentage(1 - leg.found)} of its edges lost at {leg.station}")
         because = f": {listed(why, 3)}" if why else ""
-        share = f"{sum(leg.tells for leg in mine):.0%}"
+        share = percentage(sum(leg.tells for leg in mine))
         out.append(f"Leg {j} contributes little, {share} of the edges' information{because}.")
     return tuple(out)
 
@@ -290,13 +290,9 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
 def _cells(leg: LegForecast) -> tuple[str, ...]:
     sigma = f"{leg.sigma:.2f} px" if math.isfinite(leg.sigma) else "–"
     return (
-        _percent(leg.seen),
-        _percent(leg.found),
+        percentage(leg.seen),
+        percentage(leg.found),
         sigma,
-        _percent(leg.tells),
-        _percent(leg.variance),
+        percentage(leg.tells),
+        percentage(leg.variance),
     )
-
-
-def _percent(share: float) -> str:
-    return f"{share:.0%}" if math.isfinite(share) else "–"

@@ -42,9 +42,9 @@ RGB = {
 }  # fmt: skip
 """Colours of legs on images, those of ``viewer/src/overlay.css``."""
 NOMINAL_OVER_IMAGES_TEXT = (
-    "Lines: the nominal model's legs in their colours; circles: its joints. By the pose found they"
+    "Lines: the nominal model's legs in their colours; circles: its joints. At the pose found they"
     " lie on the legs to a few pixels, as far as the nominal model is right; where they do not, or"
-    " follow another leg, something is mixed up. By a pose by hand they need only lie near the"
+    " follow another leg, something is mixed up. At a pose by hand they need only lie near the"
     " legs."
 )
 

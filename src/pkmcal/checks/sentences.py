@@ -24,7 +24,7 @@ from pkmcal.outcome import Figure, Mark, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import DISPLAY_UNITS, Chance, count, listed, number, with_unit
+from pkmcal.wording import DISPLAY_UNITS, Chance, count, listed, number, percentage, with_unit
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
 """Share of saturated pixels on the legs above which edges are lost; a highlight covers a tenth. Not
@@ -60,9 +60,10 @@ JOINT_COLUMNS = {
     "Lowest": "",
     "Highest": "",
     "Range used": "From the lowest to the highest reading, of the mechanism file's range.",
-    "Near low end": f"Configurations with a reading in the lowest {NEAR_END:.0%} of the range;"
-    " readings near both ends determine the joint's offset best.",
-    "Near high end": f"Configurations with a reading in the highest {NEAR_END:.0%} of the range.",
+    "Near low end": f"Configurations with a reading in the lowest {percentage(NEAR_END)} of the"
+    " range; readings near both ends determine the joint's offset best.",
+    "Near high end": f"Configurations with a reading in the highest {percentage(NEAR_END)} of the"
+    " range.",
 }
 KINEMATICS_SENTENCE = (
     "The nominal machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
@@ -241,9 +242,9 @@ def _cards(check: SessionCheck) -> tuple[Figure, ...]:
         out.append(
             Figure(
                 "How much of the joints' ranges is used?",
-                ((f"{least.used:.0%}", ""),),
+                ((percentage(least.used), ""),),
                 f"by {least.name}, the least of {count(len(used), 'joint')}",
-                f"limit {MAJORITY:.0%}",
+                f"limit {percentage(MAJORITY)}",
                 "good" if least.used >= MAJORITY else Level.NOTE,
             )
         )
@@ -268,8 +269,8 @@ def _stations_table(check: SessionCheck) -> Table:
             motion if math.isfinite(station.moved) else "–",
             f"{station.legs:.1f} of {check.n_legs}" if finite else "–",
             _number(station.blur, "{:.1f} px"),
-            _number(station.saturated, "{:.0%}"),
-            _number(station.black, "{:.0%}"),
+            percentage(station.saturated),
+            percentage(station.black),
         )
         rows.append(Row(station.name, cells, mark=mark))
     return _table("Stations", STATION_COLUMNS, tuple(rows), first=6)
@@ -301,7 +302,7 @@ def _joints_table(joints: tuple[JointCheck, ...]) -> Table:
             (
                 _reading(joint.low, joint.unit),
                 _reading(joint.high, joint.unit),
-                _number(joint.used, "{:.0%}"),
+                percentage(joint.used),
                 *(str(n) if math.isfinite(joint.used) else "–" for n in joint.ends),
             ),
             mark=Level.NOTE if joint.used < MAJORITY else "good",

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pkmcal.errors import InputError, legible
 from pkmcal.outcome.progress import Progress, no_progress, part, whole
 from pkmcal.terminal import err, print_points
+from pkmcal.wording import percentage
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -156,7 +157,7 @@ def _progress_lines() -> Generator[Progress]:
             text, share, remaining = step[0]
             if text:
                 times = [f"{time.monotonic() - begin:.0f} s", *([remaining] if remaining else [])]
-                sys.stderr.write(f"{legible(text)} ({', '.join([f'{share:.0%}', *times])})\n")
+                sys.stderr.write(f"{legible(text)} ({', '.join([percentage(share), *times])})\n")
 
     # in a thread, because a step may take minutes without a call of report
     thread = threading.Thread(target=print_lines, daemon=True)

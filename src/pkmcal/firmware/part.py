@@ -26,7 +26,7 @@ from pkmcal.files import (
     validated_document,
 )
 from pkmcal.firmware.contract import PrintedPart, Printer, reachable_carriages
-from pkmcal.wording import listed
+from pkmcal.wording import listed, percentage
 
 MOST_MARKS, MOST_DISTANCES = 200, 1000
 MOST_DEVIATION = 0.1
@@ -172,7 +172,7 @@ def _apart(document: Document, number: int, entry: DistanceEntry, drawn: float) 
             "this distance is far from that of the commanded positions",
             where=where,
             found=f"{value:g} mm",
-            expected=f"{drawn:.4g} mm, to {MOST_DEVIATION:.0%}",
+            expected=f"{drawn:.4g} mm, to {percentage(MOST_DEVIATION)}",
             next_step="Check both marks and the number; distances are from middle to middle",
         )
     return value

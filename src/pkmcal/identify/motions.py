@@ -25,7 +25,16 @@ from pkmcal.identify.tool import pose_by_parameters, reachable
 from pkmcal.levels import ALIGNED_ANGLE, NAMED_SHARE, NEARLY_ALL, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
-from pkmcal.wording import DISPLAY_UNITS, decimals, joined, named, number, split_name, with_unit
+from pkmcal.wording import (
+    DISPLAY_UNITS,
+    decimals,
+    joined,
+    named,
+    number,
+    percentage,
+    split_name,
+    with_unit,
+)
 
 AXIS_LETTERS = "xyz"
 MOST_GROUPS = 120
@@ -482,7 +491,7 @@ def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
         does = "stretch" if stretch > 0 else "shrink"
         return (
             f": with {joined(what)}, the bed looks as flat, and x and y {does} by"
-            f" {abs(stretch):.2%}"
+            f" {percentage(abs(stretch), 2)}"
         )
 
     return how

@@ -24,7 +24,7 @@ from pkmcal.mechanisms.disturbances import growth_by_readings, tool_shift
 from pkmcal.mechanisms.region import REGION_AXES, Region
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, doubtful, note, wrong
-from pkmcal.wording import amount, brief, count, listed, number
+from pkmcal.wording import amount, brief, count, listed, number, percentage
 
 DIFFERENCE_FORMAT = 1
 MOST_CHANGES_NAMED = 4
@@ -302,9 +302,9 @@ def _assumptions(
         " independent."
     )
     out.append(
-        f"{count(shared, 'configuration')} were seen by both, {share:.0%} of what the one that has"
-        " fewer saw; their noise is taken to be common to both, and all configurations to"
-        " be equally informative."
+        f"{count(shared, 'configuration')} were seen by both, {percentage(share)} of what the"
+        " one that has fewer saw; their noise is taken to be common to both, and all"
+        " configurations to be equally informative."
         if shared
         else "They share no configuration, so the noise of one is independent of the other's."
     )

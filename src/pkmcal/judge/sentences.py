@@ -44,6 +44,7 @@ from pkmcal.wording import (
     listed,
     named,
     number,
+    percentage,
     with_unit,
 )
 
@@ -455,7 +456,7 @@ def _detectable_clause(judged: ChangeTests) -> str:
     what = "leg's length" if zeros[0].unit == "m" else "motor's zero"
     return (
         f"a change of any {what} by {with_unit(*least_size(zeros))}, depending on the leg, would"
-        f" have been found with a probability of {DETECTION_POWER:.0%}"
+        f" have been found with a probability of {percentage(DETECTION_POWER)}"
     )
 
 

@@ -17,14 +17,16 @@ from pkmcal.observe.jpegs import narrowed
 
 FULL_IMAGES, FULL_WIDTH, USUAL_WIDTH = 12, 2048, 640
 """Number of the first images, which keep their pixels, their largest width, and that of the others,
-px: a page with 45 images and their strips has less than 3 MB."""
+px."""
 PAGE_IMAGE_CHARACTERS = 8_000_000
 """Characters of all images of a page."""
 SMALL_WIDTH = 256
 """Width (px) of an image for which the budget holds no more."""
 WEBP_QUALITY = 80
-WEBP_METHOD = 2
-"""Effort of the encoder, 0 to 6: more than 2 takes twice the time for a fifteenth of the size."""
+NARROWED_WEBP_QUALITY = 75
+"""Likewise of an image that has lost its pixels: the encoder's default."""
+WEBP_METHOD = 4
+"""Effort of the encoder, 0 to 6: less costs a fifteenth of the size, more twice the time."""
 DECODED_AT_ONCE = 32
 """Images decoded before the remaining budget is checked again."""
 
@@ -59,12 +61,12 @@ def images_within(images: Sequence[tuple[Sequence[Integers], int]], room: int) -
                 yield chosen
 
 
-def base64_webp(image: Any) -> str:
+def base64_webp(image: Any, quality: int = WEBP_QUALITY) -> str:
     """Image (h, w) as a base64 WebP file."""
     from PIL import Image
 
     content = BytesIO()
-    Image.fromarray(image).save(content, "WEBP", quality=WEBP_QUALITY, method=WEBP_METHOD)
+    Image.fromarray(image).save(content, "WEBP", quality=quality, method=WEBP_METHOD)
     return base64.b64encode(content.getvalue()).decode("ascii")
 
 
@@ -77,9 +79,10 @@ def _in_widths(images: Sequence[Integers], number: int, widths: Sequence[int]) -
         image = images[number]
     except InputError:
         return [""] * len(widths)
-    out: dict[int, str] = {}
+    out, full = dict[int, str](), image.shape[1]
     # from large to small, each scaled from the previous one
     for width in sorted(widths, reverse=True):
         image = narrowed(image, width)
-        out[width] = base64_webp(image)
+        whole = image.shape[1] == full
+        out[width] = base64_webp(image, WEBP_QUALITY if whole else NARROWED_WEBP_QUALITY)
     return [out[width] for width in widths]

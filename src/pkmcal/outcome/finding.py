@@ -267,4 +267,6 @@ class _Fields(Formatter):
             return _FORMATS[first](value, rest)
         if rest in _UNITS:
             return with_unit(format(value * _UNITS[rest], first), rest)
+        if format_spec.endswith("%"):
+            return f"{format(value, format_spec).removesuffix('%')} %"
         return format(value, format_spec)

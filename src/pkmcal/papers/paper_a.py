@@ -71,7 +71,7 @@ from pkmcal.studies.simulated import (
 from pkmcal.studies.statistics import covered, mean, ratio_of_figures
 from pkmcal.studies.sweep import StudySubject, Value
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
-from pkmcal.wording import brief, number
+from pkmcal.wording import brief, number, percentage
 
 # 4.3: the experiment
 
@@ -721,8 +721,8 @@ def checks(study: StudyResult[HexapodByAxes]) -> tuple[Claim, ...]:
         ),
         prototype_claim(
             prototype_figures(study),
-            f"within {TOLERANCE:.0%}; what follows the nominal model's error, within"
-            f" {OPEN_TOLERANCE:.0%}",
+            f"within {percentage(TOLERANCE)}; what follows the nominal model's error, within"
+            f" {percentage(OPEN_TOLERANCE)}",
         ),
     )  # fmt: skip
 

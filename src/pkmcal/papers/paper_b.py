@@ -51,7 +51,7 @@ from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.statistics import Summary, ratio_of_figures
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
-from pkmcal.wording import number
+from pkmcal.wording import number, percentage
 
 # V.A: the experiment
 
@@ -459,7 +459,7 @@ def checks(study: StudyResult[HexapodByLegs], ran: ControlledHexapod) -> tuple[C
     return (
         *_calibrated(study),
         *_controlled(ran),
-        prototype_claim(prototype_figures(study), f"within {TOLERANCE:.0%}{TWO_SIGMA}"),
+        prototype_claim(prototype_figures(study), f"within {percentage(TOLERANCE)}{TWO_SIGMA}"),
     )
 
 

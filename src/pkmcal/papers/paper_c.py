@@ -69,7 +69,7 @@ from pkmcal.studies.simulated import (
 )
 from pkmcal.studies.statistics import each_rms, ratio_of_figures, rms_over_runs
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
-from pkmcal.wording import MINUS_SIGN, number
+from pkmcal.wording import MINUS_SIGN, number, percentage
 
 # IV.A: the machine, its poses, and the poses of camera and board
 
@@ -810,7 +810,7 @@ def checks(study: Study, start: Before) -> tuple[Claim, ...]:
         ),
         at_most("errata", "model with rods on a machine with rods 0.3 mm apart", "mm", rods,
                 MOST_RODS, 3),
-        prototype_claim(prototype_figures(study), f"within {TOLERANCE:.0%}{TWO_SIGMA}"),
+        prototype_claim(prototype_figures(study), f"within {percentage(TOLERANCE)}{TWO_SIGMA}"),
     )  # fmt: skip
 
 

@@ -50,7 +50,7 @@ from pkmcal.report import (
 from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.web.report_page import is_remark, report_page
-from pkmcal.wording import amount, brief, count, number
+from pkmcal.wording import amount, brief, count, number, percentage
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
@@ -194,7 +194,7 @@ def report_of(
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
         explanation=_joint_accuracy(estimate, centres) if len(edges) and c.verdict.usable else "",
-        comparison=_comparison(c, tool, holdout),
+        comparison=_comparison(c, tool, holdout) if c.verdict.usable else None,
         certificate=provenance.certificate(c, digest),
         partial=any(one.sure for one in c.model_errors),
         figures=calibration_cards(c, centres, tool),
@@ -276,20 +276,22 @@ def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
     share, bed = VERDICT.nominal_error_share, findings.bed
     if bed:
         limits[FLATNESS_QUESTION] = (
-            f"limit {amount(share * bed.by_drawing, 'm')}: {share:.0%} of what the tolerances give",
+            f"limit {amount(share * bed.by_drawing, 'm')}: {percentage(share)} of what the"
+            " tolerances give",
             judged("bed.no_gain", "bed.height_unnoticed"),
         )
     elif np.any(estimate.configurations):
         limits[TOOL_QUESTION] = (
             f"platform's joints {amount(platform_sigma(estimate), 'm')}, limit"
-            f" {amount(share * findings.by_nominal, 'm')}: {share:.0%} of what the tolerances give",
+            f" {amount(share * findings.by_nominal, 'm')}: {percentage(share)} of what the"
+            " tolerances give",
             judged("platform.no_gain", "machine.undetermined"),
         )
     weights = np.concatenate([*estimate.weights.values()])
     if weights.size:
         rejected = float(np.mean(weights < INLIER_WEIGHT))
         limits[DATA_QUESTION] = (
-            f"{rejected:.0%} rejected, limit {VERDICT.too_many_rejected:.0%}",
+            f"{percentage(rejected)} rejected, limit {percentage(VERDICT.too_many_rejected)}",
             judged("data.rejected_share", "edges.leg_seldom_seen"),
         )
     scales = [one.scale for one in statistics.groups if one.n and one.name in estimate.weights]

@@ -40,9 +40,9 @@ INTRINSIC_WORDS = {
     "center.y": "centre y",
 }
 CAMERA_MODELS_TEXT = (
-    "Every model with more and more distortion terms. What counts is the error on views left out of"
-    " the fit; a term is taken only where they gain from it, and the model with the fewest"
-    " parameters among equals."
+    "Every model with more and more distortion terms. What counts is the error on held-out"
+    " views; a term is taken only where it lowers that, and among equals the model with the fewest"
+    " parameters."
 )
 PROJECTION_TEXT = (
     "1σ, in the worst direction, of the pixel of a point that stands still relative to the boards,"
@@ -96,7 +96,7 @@ def outcome_of(
             ),
             Part(
                 "field",
-                "Field",
+                "Residuals and coverage",
                 blocks=(_field_block(c, [Path(path) for path in paths]), *field_plots(c)),
             ),
             Part(
@@ -182,7 +182,7 @@ def _projection(c: CameraCalibration, distances: Sequence[float]) -> Table:
         name = f"{brief(distance)} m" if np.isfinite(distance) else "infinity"
         cells = (middle, float(np.median(finite)), float(finite.max()))
         rows.append(Row(name, tuple(map(brief, cells))))
-    columns = ("Distance", "centre, px", "median, px", "worst, px")
+    columns = ("Distance", "Centre, px", "Median, px", "Worst, px")
     return Table("Standard deviation of a point's pixel", columns, tuple(rows))
 
 
@@ -200,7 +200,7 @@ def _compared(c: CameraCalibration) -> Table:
         )
         for one in c.compared
     ]
-    columns = ("Model", "Distortion", "Fitted, px", "Left out, px")
+    columns = ("Model", "Distortion", "Fitted, px", "Held out, px")
     note = "✓: chosen."
     return Table("", columns, tuple(rows), note, brief=False, words=(1,))
 

@@ -12,6 +12,7 @@ from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
 from pkmcal.outcome.blocks import Block
 from pkmcal.outcome.blocks.images import Arrow, Images
 from pkmcal.outcome.blocks.plot import panels
+from pkmcal.report.camera import INTRINSIC_UNITS, INTRINSIC_WORDS
 from pkmcal.report.camera_plots import image_map
 from pkmcal.report.field import ImageField, field_image
 from pkmcal.report.watch import NO_VALUE_SIGN
@@ -48,9 +49,10 @@ def outcome_of(d: CameraDifference) -> Outcome:
                 "Difference of projections",
                 blocks=_maps(d),
                 tables=(_projection(d),),
+                menu="Projections",
             ),
             Part("parameters", "Parameters", tables=(_parameters(d),)),
-            Part("how", "How they were compared", (ROTATION_TEXT,)),
+            Part("how", "How they were compared", (ROTATION_TEXT,), menu="Method"),
         ),
         document=d.as_dict(),
     )
@@ -104,10 +106,20 @@ def _parameters(d: CameraDifference) -> Table:
     sides = [_values(one.camera) for one in (d.a, d.b)]
     names = dict.fromkeys([*sides[0], *sides[1]])
     none = (NO_VALUE_SIGN, NO_VALUE_SIGN)
-    rows = [Row(name, (*sides[0].get(name, none), *sides[1].get(name, none))) for name in names]
-    columns = ("Parameter", "A", "1σ", "B", "1σ")
+    rows = [
+        Row(
+            INTRINSIC_WORDS.get(name, name),
+            (
+                *sides[0].get(name, none),
+                *sides[1].get(name, none),
+                INTRINSIC_UNITS.get(name.partition(".")[0], ""),
+            ),
+        )
+        for name in names
+    ]
+    columns = ("Parameter", "A", "1σ", "B", "1σ", "Unit")
     note = "Parameters of two lenses differ where their projections do not: ξ with f, k1 with k2."
-    return Table("", columns, tuple(rows), note)
+    return Table("", columns, tuple(rows), note, words=(5,))
 
 
 def _values(camera: Camera) -> dict[str, tuple[str, str]]:
@@ -126,13 +138,14 @@ def _values(camera: Camera) -> dict[str, tuple[str, str]]:
 def _maps(d: CameraDifference) -> tuple[Block, ...]:
     """Maps of the difference and of its standard deviation, and arrows."""
     size = d.a.camera.image_size
-    most = brief(float(np.nanmax(d.lengths)))
-    maps = [image_map("difference", "Difference", f"Up to {most} px", size, d.lengths, "px")]
+    kinds = [("difference", "Difference", d.lengths)]
     if d.sigma is not None:
-        worst = brief(float(np.nanmax(d.sigma)))
-        maps.append(
-            image_map("chance", "By chance, 1σ", f"Up to {worst} px", size, d.sigma, "1σ, px")
-        )
+        kinds.append(("chance", "By chance, 1σ", d.sigma))
+    largest = [float(np.nanmax(values)) for _, _, values in kinds]
+    maps = [
+        image_map(name, title, f"Up to {brief(own)} px", size, values, "px", max(largest))
+        for (name, title, values), own in zip(kinds, largest, strict=True)
+    ]
     some = slice(ARROW_EVERY // 2, None, ARROW_EVERY)
     at, off = (x[some, some].reshape(-1, 2) for x in (d.pixels, d.difference))
     arrows = tuple(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from pkmcal.arrays import Array
@@ -72,12 +74,21 @@ def uncertainty_plot(c: CameraCalibration, distance: float) -> Plot:
 
 
 def image_map(
-    name: str, title: str, alt: str, image_size: tuple[int, int], values: Array, label: str
+    name: str,
+    title: str,
+    alt: str,
+    image_size: tuple[int, int],
+    values: Array,
+    label: str,
+    most: float = 0.0,
 ) -> Plot:
-    """Map of values (rows, columns) in the cells of an image, NaN for none."""
+    """Map of values (rows, columns) in the cells of an image, NaN for none.
+
+    most : end of the colour scale, for maps with a common one; the largest value by default.
+    """
     width, height = image_size
     rows, columns = values.shape
-    most = float(np.nanmax(values, initial=0.0)) or 1.0
+    most = most or float(np.nanmax(values, initial=0.0)) or 1.0
     x, y = (-0.5, width - 0.5), (-0.5, height - 0.5)
     return Plot(
         name=name,
@@ -154,8 +165,21 @@ def views_plot(c: CameraCalibration) -> Plot | None:
     )
 
 
+def _runs(terms: Sequence[str]) -> list[str]:
+    """Terms of a distortion with three or more in sequence as one, ``k3–k6``."""
+    runs: list[list[str]] = []
+    for term in terms:
+        last = runs[-1][-1] if runs else ""
+        follows = last[:1] == term[:1] and last[1:].isdigit() and term[1:] == f"{int(last[1:]) + 1}"
+        if follows:
+            runs[-1].append(term)
+        else:
+            runs.append([term])
+    return [name for run in runs for name in ([f"{run[0]}–{run[-1]}"] if len(run) > 2 else run)]
+
+
 def models_plot(c: CameraCalibration) -> Plot | None:
-    """Error of each compared model on the views that it was fitted to, and on those left out; None
+    """Error of each compared model on the views that it was fitted to, and on those held out; None
     for a single model.
     """
     if len(c.compared) < 2:
@@ -163,8 +187,8 @@ def models_plot(c: CameraCalibration) -> Plot | None:
     fitted, left_out = list[Point](), list[Point]()
     for one in c.compared:
         chosen = (one.model, one.terms) == (c.camera.model, c.terms)
-        name = ("✓ " if chosen else "") + " ".join((one.model, *one.terms))
-        tip = f"{name}: fitted {brief(one.rms)} px, left out {brief(one.left_out)} px"
+        name = ("✓ " if chosen else "") + " ".join((one.model, *_runs(one.terms)))
+        tip = f"{name}: fitted {brief(one.rms)} px, held out {brief(one.left_out)} px"
         for points, value in ((fitted, one.rms), (left_out, one.left_out)):
             if np.isfinite(value) and value > 0:
                 points.append(Point(x=rounded(value), y=name, tip=tip))
@@ -174,11 +198,11 @@ def models_plot(c: CameraCalibration) -> Plot | None:
         name="models",
         title="Error of each model",
         caption="",
-        alt=f"Errors of {len(names)} models, fitted and left out; the table has the numbers",
+        alt=f"Errors of {len(names)} models, fitted and held out; the table has the numbers",
         x=log_axis("root mean square, px", (float(point.x) for point in points)),
         y=category_axis(names),
         marks=(
             DotsMark(name="fitted", colour="nominal", points=tuple(fitted)),
-            DotsMark(name="left out", colour="calibrated", points=tuple(left_out)),
+            DotsMark(name="held out", colour="calibrated", points=tuple(left_out)),
         ),
     )

@@ -65,10 +65,9 @@ def section(estimate: Estimate) -> Part | None:
     legs = [split_name(table.names[k])[0] for k in free]
     return Part(
         "correlations",
-        "What is known together",
+        "Correlations",
         (f"{text} {HOW_TOGETHER}",),
         blocks=(correlation_plot(rho, names, legs), *((listing,) if closest else ())),
-        menu="Correlations",
     )
 
 

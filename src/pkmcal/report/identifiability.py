@@ -97,9 +97,10 @@ def directions_headline(identification: Identification) -> str:
         return f"{start} Each is determined better by the data than by the nominal model."
     parts: list[str] = []
     if lost:
-        parts.append(f"{count(lost, 'direction')} no amount of such data would determine")
+        parts.append(f"no amount of such data would determine {count(lost, 'direction')}")
     if ranks.weak:
-        parts.append(f"{count(len(ranks.weak), 'direction')} determined better by the prior")
+        verb = "is" if len(ranks.weak) == 1 else "are"
+        parts.append(f"{count(len(ranks.weak), 'direction')} {verb} determined better by the prior")
     return f"{start} {capital(joined(parts))}."
 
 

@@ -40,7 +40,7 @@ from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.field import FIELD_EDGE_FRACTIONS, edge_offsets
 from pkmcal.report.page_links import Place
 from pkmcal.report.residuals import outward_shift
-from pkmcal.report.strips import edge_lines, strips_of_image
+from pkmcal.report.strips import STRIP_ROWS, edge_lines, strips_of_image
 from pkmcal.session.image_files import Image
 from pkmcal.session.load import RejectedStation, Session, Station
 from pkmcal.solver.kernels import INLIER_WEIGHT
@@ -61,7 +61,7 @@ class AlbumSize:
     images: int = 400
     # characters of all images
     characters: int = PAGE_IMAGE_CHARACTERS
-    # characters of all strips, of the first images: with those of 45 images a page has 3 MB
+    # characters of all strips, of the first images: those of some sixty
     strip_characters: int = 700_000
 
 
@@ -385,10 +385,13 @@ class _ImageOverlays:
                 axis=1
             )
             mine, lines = mine[finite], lines.select(np.asarray(finite))
-            self.strips[place] = strips, sheet = strips_of_image(c, image, mine, lines)
+            self.strips[place] = strips, sheet = strips_of_image(image, lines)
             room -= len(sheet) + sum(len(one.model_dump_json()) for one in strips)
-            for k, n in enumerate(mine.tolist()):
-                self.edges[place][n] = replace(self.edges[place][n], strip=k)
+            for k, (n, strip) in enumerate(zip(mine.tolist(), strips, strict=True)):
+                middle = len(strip.offset) // 2
+                outward = number(strip.offset[middle], 3, signed=True)
+                tip = self._tip(n, f"{outward} ± {brief(strip.sigma[middle])}")
+                self.edges[place][n] = replace(self.edges[place][n], strip=k, tip=tip)
 
     def image(self, s: int, photo: Image, webp: str, level: float) -> blocks.Image:
         """Image with its overlay."""
@@ -422,6 +425,7 @@ class _ImageOverlays:
                 "overlays": (blocks.Overlay(layers=tuple(one for one in layers if one.shapes)),),
                 "strips": strips,
                 "strip_webp": sheet,
+                "strip_rows": STRIP_ROWS if strips else 0,
             }
         )
 
@@ -462,15 +466,8 @@ class _ImageOverlays:
         curves = straightened(edge_curves(self.calibration, mine, s))
         for n, points in zip(mine.tolist(), curves, strict=True):
             weight = float(estimate.edge_weights[n])
-            across, tilt = estimate.edge_residuals[n].tolist()
-            leg, tube, side = (int(x[n]) for x in (edges.leg, edges.tube, edges.side))
-            coarse = ", by its silhouette" if edges.coarse[n] else ""
-            tip = (
-                f"{edge_name(leg, tube, side).capitalize()}{coarse}:"
-                f" {number(float(shifts[n]), 2, signed=True)} px outward;"
-                f" {residual_words(across, tilt, weight)}"
-            )
-            drawn = polyline(leg, points, weight < INLIER_WEIGHT, tip)
+            tip = self._tip(n, number(float(shifts[n]), 2, signed=True))
+            drawn = polyline(int(edges.leg[n]), points, weight < INLIER_WEIGHT, tip)
             if drawn:
                 self.edges[s, int(edges.configuration[n])][n] = drawn
         # residuals at the middles of the edges
@@ -486,6 +483,18 @@ class _ImageOverlays:
                     dashed=bool(estimate.edge_weights[n] < INLIER_WEIGHT),
                 )
                 self.residuals[s, int(edges.configuration[n])].append(arrow)
+
+    def _tip(self, n: int, outward: str) -> str:
+        """Tooltip of an edge.
+
+        outward : its displacement from the predicted edge, px.
+        """
+        edges, estimate = self.calibration.observation.edges, self.calibration.estimate
+        across, tilt = estimate.edge_residuals[n].tolist()
+        name = edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n])).capitalize()
+        coarse = ", by its silhouette" if edges.coarse[n] else ""
+        words = residual_words(across, tilt, float(estimate.edge_weights[n]))
+        return f"{name}{coarse}: {outward} px outward; {words}"
 
     def _missed(self, rejected: list[Rejection], s: int, configurations: Integers) -> None:
         """Collect predictions of rejected edges, each with the reason."""

@@ -26,7 +26,7 @@ from pkmcal.outcome.blocks.text import Fact, Facts, Listing, Paragraph
 from pkmcal.report import parameters
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
-from pkmcal.wording import amount, brief, count, decimals, number
+from pkmcal.wording import amount, brief, capital, count, decimals, number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
@@ -107,10 +107,10 @@ def stations(session: Session, observation: Observation, estimate: Estimate) -> 
         )
     if not rows:
         return None
-    columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
+    columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of orientation")
     columns += ("Edge shift, px",) if edges else ()
     what = "Camera" if session.stations else "Tracker"
-    columns += ("Away from the pose by hand", what)
+    columns += ("From the pose by hand", what)
     title = f"Where the {what.lower()}s stood"
     table = Table(title, columns, tuple(rows), brief=False, words=(len(columns) - 1,))
     return Part("stations", f"{what}s", tables=(table,))
@@ -288,7 +288,7 @@ def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estima
     """Section on rejections, and on tightly correlated parameters."""
     lists = tuple(
         Listing(
-            title=f"{reason.count} {reason.text}, in {count(reason.images, 'image')}",
+            title=f"{capital(reason.text)}: {reason.count}, in {count(reason.images, 'image')}",
             items=(
                 *(f"{image}: {what}" for image, what in reason.cases),
                 *(
@@ -303,7 +303,7 @@ def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estima
     )
     pairs = parameters.bound_together(estimate)
     together = (
-        Listing(title="Values that hang together", items=pairs)
+        Listing(title="Correlated values", items=pairs)
         if pairs
         else Paragraph(
             text="No two values have a correlation of more than"
@@ -311,8 +311,8 @@ def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estima
         )
     )
     text = () if lists else ("Nothing was rejected.",)
-    title = "What was left out, and what stays open"
-    return Part("rejected", title, text, blocks=(*lists, together), menu="Left out")
+    title = "Rejected measurements and correlated values"
+    return Part("rejected", title, text, blocks=(*lists, together), menu="Rejected")
 
 
 def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, ...]:

@@ -14,7 +14,6 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.overlays import (
-    edge_name,
     measured_curves,
     offsets_across_curves,
     own_edges,
@@ -22,7 +21,6 @@ from pkmcal.observe.overlays import (
 from pkmcal.observe.page_images import base64_webp
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome.blocks.images import Strip
-from pkmcal.wording import brief, number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
@@ -111,27 +109,16 @@ def sampled_strip(image: Array | Integers, curve: Array, normal: Array) -> tuple
     return map_coordinates(image, [y, x], order=1, mode="nearest", output=float), along
 
 
-def strips_of_image(
-    c: Calibration, image: Integers, mine: Integers, lines: EdgeLines
-) -> tuple[tuple[Strip, ...], str]:
-    """Strips of the edges ``mine`` in an image, and their common WebP file in base64."""
-    edges, strips, levels = c.observation.edges, list[Strip](), list[Array]()
-    for k, n in enumerate(mine.tolist()):
+def strips_of_image(image: Integers, lines: EdgeLines) -> tuple[tuple[Strip, ...], str]:
+    """Strips of the edges with these lines in an image, and their common WebP file in base64."""
+    strips, levels = list[Strip](), list[Array]()
+    for k in range(len(lines.curve)):
         level, along = sampled_strip(image, lines.curve[k], lines.normal[k])
         places = np.linspace(0, along[-1], STRIP_LINE_POINTS)
         offset, sigma = (np.interp(places, along, one[k]) for one in (lines.offset, lines.sigma))
-        middle = STRIP_LINE_POINTS // 2
-        name = edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n])).capitalize()
-        title = (
-            f"{name}: {number(float(offset[middle]), 3, signed=True)} ±"
-            f" {brief(float(sigma[middle]))} px outward"
-        )
         strips.append(
             Strip(
-                title=title,
-                row=k * STRIP_ROWS,
                 length=level.shape[1],
-                across=STRIP_ROWS,
                 offset=tuple(np.round(offset, 3).tolist()),
                 sigma=tuple(np.round(sigma, 3).tolist()),
             )
@@ -141,6 +128,6 @@ def strips_of_image(
     if not strips:
         return (), ""
     sheet = np.zeros((STRIP_ROWS * len(strips), max(one.length for one in strips)), np.uint8)
-    for strip, level in zip(strips, levels, strict=True):
-        sheet[strip.row : strip.row + STRIP_ROWS, : strip.length] = np.rint(level)
+    for k, level in enumerate(levels):
+        sheet[k * STRIP_ROWS : (k + 1) * STRIP_ROWS, : level.shape[1]] = np.rint(level)
     return tuple(strips), base64_webp(sheet)

@@ -8,7 +8,7 @@ from math import degrees
 from pkmcal.judge.against_truth import AgainstTruth
 from pkmcal.outcome import Outcome, Part, Row, Table
 from pkmcal.outcome.blocks.log_bar import Magnitude
-from pkmcal.wording import amount
+from pkmcal.wording import amount, percentage
 
 
 def with_truth(outcome: Outcome, comparison: AgainstTruth) -> Outcome:
@@ -26,7 +26,8 @@ def with_truth(outcome: Outcome, comparison: AgainstTruth) -> Outcome:
         true = Magnitude(
             label="True error", value=error * 1e3, text=amount(error, "m"), role="test"
         )
-        bar = bar.model_copy(update={"magnitudes": (*bar.magnitudes, true)})
+        note = f"{bar.note} True error: distance of the calibrated machine from the simulated one."
+        bar = bar.model_copy(update={"magnitudes": (*bar.magnitudes, true), "note": note})
     return replace(outcome, comparison=bar, parts=(part, *outcome.parts))
 
 
@@ -42,7 +43,7 @@ def truth_table(comparison: AgainstTruth) -> Table:
     ):
         times = f"{old / new:.0f} times nearer" if new > 0 else ""
         rows.append(Row(what, (f"{old:.2f}{unit}", f"{new:.3f}{unit}", times)))
-    columns = ("Against the truth", "Nominal model", "Calibrated", "")
+    columns = ("Against the truth", "Nominal model", "Calibrated", "Gain")
     return Table("", columns, tuple(rows), brief=False)
 
 
@@ -50,6 +51,6 @@ def truth_sentence(comparison: AgainstTruth) -> str:
     """Sentence on the share of values within two standard deviations."""
     within, count = comparison.within, comparison.count
     return (
-        f"{within} of {count} values ({within / count:.0%}) lie within two"
+        f"{within} of {count} values ({percentage(within / count)}) lie within two"
         " of their standard deviations of the truth; 95 % should."
     )

@@ -30,7 +30,17 @@ from pkmcal.outcome.blocks.plot import (
     rounded,
 )
 from pkmcal.report.charts import NORMAL_90, bar_plot
-from pkmcal.wording import DISPLAY_UNITS, Chance, amount, brief, count, listed, named, number
+from pkmcal.wording import (
+    DISPLAY_UNITS,
+    Chance,
+    amount,
+    brief,
+    count,
+    listed,
+    named,
+    number,
+    percentage,
+)
 
 NO_VALUE_SIGN = "–"
 STAMPS = {
@@ -63,7 +73,7 @@ LEG_COLUMNS = {
     "By chance": "Probability of as much in a machine that did not change, all tests allowed for.",
     "Zero off by": "Change of the zero of the reading, if nothing else changed.",
     "Found from": "Smallest change of the zero with a probability of"
-    f" {DETECTION_POWER:.0%} to be found.",
+    f" {percentage(DETECTION_POWER)} to be found.",
     "Base joint from, mm": "Smallest displacement that would be found as often, in the direction"
     " seen best, and seen worst.",
     "Platform joint from, mm": "Smallest displacement that would be found as often, in the"
@@ -269,8 +279,8 @@ def _cards(w: Watch) -> tuple[Figure, ...]:
             Figure(
                 "What would have been found?",
                 (least_size(sizes),),
-                f"of the zero of a leg's reading, depending on the leg, with {DETECTION_POWER:.0%}"
-                " probability",
+                "of the zero of a leg's reading, depending on the leg, with"
+                f" {percentage(DETECTION_POWER)} probability",
             )
         )
     out.append(

@@ -22,7 +22,7 @@ LIMIT_DIGITS, VALUE_DIGITS = 2, 4
 """Significant digits of the accuracy with which a map starts, and of its values."""
 SLICES_READING_TEXT = (
     "Slices at home's orientation; the stronger the colour, the worse. The green line encloses"
-    " where the accuracy below holds. Its share is that of poses spread evenly over the workspace"
+    " where the wanted accuracy holds. Its share is that of poses spread evenly over the workspace"
     " and its orientations. Crosses: measured poses near the slice. Error before: distance of the"
     " nominal model's pose from the calibrated one at the same readings, frames laid over each"
     " other. σ after: one standard deviation by the calibrated geometry; the noise of single"
@@ -83,8 +83,8 @@ def _table(tool_map: ToolMap) -> Table:
     for name, place, turn in kinds:
         turned = middle_and_worst(np.rad2deg(turn)) if turns else ()
         rows.append(Row(name, (*middle_and_worst(place * 1e3), *turned)))
-    columns = ("Over the region", "place, median, mm", "worst, mm")
-    columns += ("turn, median, °", "worst, °") if turns else ()
+    columns = ("Over the region", "Position, median, mm", "Position, worst, mm")
+    columns += ("Orientation, median, °", "Orientation, worst, °") if turns else ()
     return Table("", columns, tuple(rows), brief=False)
 
 

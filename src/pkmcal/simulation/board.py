@@ -26,6 +26,7 @@ from pkmcal.simulation.render import ScenePart
 from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Box, Cylinder, Shape, turned_components
 from pkmcal.simulation.surfaces import Material, Pattern, SmoothNoise
+from pkmcal.wording import percentage
 
 BOARD_THICKNESS = 0.004
 """Thickness of the plate, in metres."""
@@ -228,8 +229,8 @@ def place_board(
     if visible[best] < LEAST_VISIBLE_CORNERS:
         raise GeometryError(
             f"there is no place on the {on} where all stations see the board",
-            found=f"{visible[best]:.0%} of its corners at most",
-            expected=f"{LEAST_VISIBLE_CORNERS:.0%}",
+            found=f"{percentage(visible[best])} of its corners at most",
+            expected=percentage(LEAST_VISIBLE_CORNERS),
             next_step=VISIBILITY_ADVICE[on],
         )
     return places[best]

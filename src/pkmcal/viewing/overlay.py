@@ -57,7 +57,11 @@ def overlay_after_gesture(content: SessionContent, request: ViewRequest) -> Over
     return OverlayAnswer(
         pose=pose_rows(pane.T_camera_base),
         place=tuple(
-            Property(label=name, value=", ".join(number(x, STATION_POSE_DECIMALS) for x in part))
+            Property(
+                label=name,
+                value=", ".join(number(x, STATION_POSE_DECIMALS) for x in part)
+                + ("" if name == "up" else " m"),
+            )
             for name, part in place.items()
         ),
         layers=(edge_layer("machine", [*edges, *_bare_limbs(pane)]), *joint_layers(spots)),

@@ -65,7 +65,7 @@ class MachineDocument(Head):
 class Verdict(Schema):
     """Judgement at the top of a report.
 
-    tone : good, partial (usable, with exceptions), bad, or neutral (nothing is judged).
+    tone : good, partial (with exceptions or doubts), bad, or neutral (nothing is judged).
     stamp : one to three words.
     explanation : line below the headline.
     reasons : points below both.

@@ -29,12 +29,12 @@ def report_page(outcome: Outcome, made: datetime | None = None) -> str:
 
 
 def _tone(outcome: Outcome) -> Literal["good", "partial", "bad", "neutral"]:
-    """Tone of the verdict."""
+    """Tone of the verdict: the colour of its sign."""
     if outcome.neutral:
         return "neutral"
-    if not outcome.verdict.usable:
-        return "bad"
-    return "partial" if outcome.partial else "good"
+    if outcome.mark == "good":
+        return "good"
+    return "bad" if outcome.mark is Level.WRONG else "partial"
 
 
 def report_document(outcome: Outcome, made: datetime | None = None) -> shapes.ReportDocument:

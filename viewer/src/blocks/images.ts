@@ -4,11 +4,14 @@ import "./images.css";
 import type { Image, Images } from "../document";
 import { h } from "../dom";
 import { legClass } from "../marks";
-import { imageSvg } from "../overlay";
+import { hrefOf, imageSvg } from "../overlay";
+import { startTones } from "../tones";
 import type { Context } from "./index";
 
 export function images(block: Images, { selection, viewer }: Context): HTMLElement {
+  // of images by hand each is a group of its own
   const groups = [...new Set(block.images.map((image) => image.group))].filter(Boolean).sort();
+  const filters = groups.length > 1 && groups.length < block.images.length ? ["", ...groups] : [];
   const grid = h("div", { class: `images ${block.size}` });
   const bar = h("div", { class: "images-bar" });
   const element = h("div", {}, bar, grid);
@@ -21,6 +24,8 @@ export function images(block: Images, { selection, viewer }: Context): HTMLEleme
   };
   const figure = (image: Image): HTMLElement => {
     const picture = imageSvg(image);
+    const background = picture.querySelector("image");
+    if (background) void startTones(background, hrefOf(image));
     picture.setAttribute("aria-hidden", "true"); // the button has the name, with the texts in the image
     const texts = block.size === "figure" ? [...picture.querySelectorAll("text")].map((text) => text.textContent) : [];
     const button = h("button", {
@@ -40,15 +45,13 @@ export function images(block: Images, { selection, viewer }: Context): HTMLEleme
     grid.replaceChildren(...(all ? some : some.slice(0, block.first)).map(figure));
     selection.apply(grid);
     bar.replaceChildren(...legend(block.legs));
-    if (groups.length > 1) {
-      bar.append(...["", ...groups].map((name) =>
-        h("button", {
-          type: "button", "aria-pressed": String(name === group), onclick: () => {
-            group = name;
-            draw();
-          },
-        }, name || "All")));
-    }
+    bar.append(...filters.map((name) =>
+      h("button", {
+        type: "button", "aria-pressed": String(name === group), onclick: () => {
+          group = name;
+          draw();
+        },
+      }, name || "All")));
     if (some.length > block.first) {
       bar.append(h("button", {
         type: "button", "aria-pressed": String(all), onclick: () => {

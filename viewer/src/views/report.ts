@@ -7,8 +7,10 @@ import type { Card, ReportDocument, Section } from "../document";
 import { h, prose } from "../dom";
 import { sign, type Mark } from "../marks";
 import { ImageViewer } from "../image_viewer";
+import { hrefOf } from "../overlay";
 import { connect, Selection } from "../selection";
 import { connectTips } from "../tips";
+import { startExponent } from "../tones";
 import { contents } from "./contents";
 import { certificate, connectPrint } from "./print";
 
@@ -107,7 +109,9 @@ function sectionOf(section: Section, context: Context): HTMLElement {
     element.append(title, ...blocks());
     return element;
   }
-  // a collapsed section is drawn when it is first opened, or printed
+  // a collapsed section is drawn when it is first opened, or printed: its images are measured before
+  const images = section.blocks.flatMap((block) => (block.kind === "images" ? block.images : []));
+  for (const image of images) void startExponent(hrefOf(image));
   const details = h("details", { class: "expert" }, h("summary", {}, title));
   const draw = (): void => { if (details.childElementCount === 1) details.append(...blocks()); };
   details.addEventListener("toggle", draw);

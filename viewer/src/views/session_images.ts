@@ -4,6 +4,7 @@ import type { SessionDocument } from "../document";
 import { h } from "../dom";
 import { type Mark, sign } from "../marks";
 import { uprightSize } from "../overlay";
+import { startTones } from "../tones";
 
 const COUNTED: Mark[] = ["good", "doubtful", "wrong"];
 
@@ -21,6 +22,7 @@ export class ImageList {
       const { width, height } = uprightSize(image);
       const picture = h("img", {
         "data-src": image.url.replace("image", "thumbnail"), alt: "", loading: "lazy", width, height,
+        onload: () => void startTones(picture, picture.src),
         onerror: () => picture.removeAttribute("src"), // its mark and its image say why
       });
       return h("button", { type: "button", title: image.title, onclick: () => choose(s, k) },

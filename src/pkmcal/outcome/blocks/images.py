@@ -111,19 +111,14 @@ class Overlay(Schema):
 class Strip(Schema):
     """Image along an edge, sampled in native pixels across the predicted edge and along it.
 
-    title : name of the edge, offset of the fitted line from the prediction, its standard deviation.
-    row : first row of the strip in the image's ``strip_webp``.
-    length, across : columns along the edge, from A to B, and rows across it, outward first; the
-        prediction is in the middle row.
+    length : columns along the edge, from A to B. Rows are across it, outward first; the prediction
+        is in the middle row.
     offset : offset of the fitted line from the prediction, px outward, at evenly spaced positions
         from the middle of the first column to that of the last.
     sigma : its standard deviation there, px.
     """
 
-    title: Text
-    row: int
     length: int
-    across: int
     offset: tuple[float, ...]
     sigma: tuple[float, ...]
 
@@ -140,6 +135,7 @@ class Image(Schema):
     url : of the image beside a page that is served, in place of ``webp``.
     overlays : of which a viewer shows one at a time.
     strip_webp : the strips one below the other, base64; empty without any.
+    strip_rows : rows of each strip.
     """
 
     title: Text
@@ -153,6 +149,7 @@ class Image(Schema):
     url: str = Field(default="", pattern=r"^(image/\d+/\d+)?$")
     overlays: tuple[Overlay, ...] = ()
     strip_webp: str = ""
+    strip_rows: int = 0
     strips: tuple[Strip, ...] = ()
 
 
