@@ -15,6 +15,7 @@ from pkmcal.files import check_own_folder
 from pkmcal.judge.repeatability import RepeatStudy, study_repeats
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, part, whole
+from pkmcal.ranges import check_number
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -95,6 +96,7 @@ def check(
         With ``repeat``, the session has no repeated images.
 
     """
+    check_number("check", "seed", seed)
     study = None
     with whole(progress, "Reading the session") as report:
         own = part(report, 0, 0.4 if repeat else 1)
