@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 from pkmcal.errors import InputError
 
-
 NO_LIMIT = 1e12
 """A larger limit of a range is none in words."""
 
