@@ -11,7 +11,7 @@ from pkmcal.checks.check import check_session
 from pkmcal.checks.pictures import picture_names, with_pictures, write_pictures
 from pkmcal.checks.results import SessionCheck
 from pkmcal.checks.sentences import outcome_of
-from pkmcal.files import check_own_folder
+from pkmcal.files import check_own_folder, given_path
 from pkmcal.judge.repeatability import RepeatStudy, study_repeats
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, part, whole
@@ -97,6 +97,7 @@ def check(
 
     """
     check_number("check", "seed", seed)
+    session = given_path(session, "a session's folder")
     study = None
     with whole(progress, "Reading the session") as report:
         own = part(report, 0, 0.4 if repeat else 1)

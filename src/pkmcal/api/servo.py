@@ -11,12 +11,14 @@ import numpy as np
 
 from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.arrays import Array
+from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.control.laws import law_named
 from pkmcal.control.simulation import LoopSettings
 from pkmcal.control.source import load_plant
 from pkmcal.control.study import HAND_ROTATION, Plan, Study, study_servoing
 from pkmcal.errors import InputError
 from pkmcal.files.quantities import in_joint_units
+from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
 from pkmcal.placement.edges import EdgeNoise
@@ -41,7 +43,7 @@ class ServoResult(FolderResult, Study):
 
 
 def servo(
-    machine: Path | str,
+    machine: SavedCalibration | Machine | Path | str,
     *,
     session: Path | str | None = None,
     station: str | None = None,
@@ -68,7 +70,8 @@ def servo(
     Parameters
     ----------
     machine :
-        A calibration's folder, a mechanism file, or the name of a built-in machine.
+        A calibration's folder, a calibration loaded by :func:`pkmcal.load_result`, a machine, a
+        mechanism file, or the name of a built-in machine.
     session :
         The calibration's session, for its cameras, where it is not found around the folder.
     station :
@@ -123,6 +126,14 @@ def servo(
     for name, value in numbers.items():
         check_number("servo", name, value)
     law_named(law)
+    for name, given in (("start", start), ("goal", goal)):
+        if given is not None and np.shape(given) != (4, 4):
+            raise InputError(
+                "this is not a platform pose",
+                where=name,
+                found=f"an array of shape {np.shape(given)}",
+                expected="T_base_platform (4, 4), m",
+            )
     loop = LoopSettings(
         law=law,
         gain=gain,
@@ -138,11 +149,11 @@ def servo(
         )  # fmt: skip
     with whole(progress, "Reading the machine") as report:
         plant = load_plant(
-            str(machine),
+            machine,
             session=None if session is None else Path(session),
             station=station,
             camera=None if camera is None else Path(camera),
-            legs=None if legs is None else tuple(number - 1 for number in legs),
+            legs=None if legs is None else tuple(int(number) - 1 for number in np.ravel(legs)),
             seed=seed,
         )
         # the machine determines whether its joints have the units of these
@@ -154,7 +165,8 @@ def servo(
             fastest = in_joint_units(speed, "m/s or rad/s", units, "--speed")
             check_number("servo", "speed", fastest)
             loop = replace(loop, speed=np.array([fastest]))
-        plan = Plan(loop, runs, seed, hand_position, hand_rotation, start, goal)
+        ends = [None if one is None else np.asarray(one, dtype=float) for one in (start, goal)]
+        plan = Plan(loop, runs, seed, hand_position, hand_rotation, *ends)
         try:
             return ServoResult.of(study_servoing(plant, plan, report))
         except (

@@ -95,11 +95,13 @@ def in_words(values: Mapping[str, Value]) -> str:
     )
 
 
-def subject_of(origin: str) -> StudySubject:
-    """Subject by a session's folder, a mechanism file or a built-in machine's name.
+def subject_of(origin: Machine | str) -> StudySubject:
+    """Subject by a machine, a session's folder, a mechanism file or a built-in machine's name.
 
     Raises InputError if the origin is none of these.
     """
+    if isinstance(origin, Machine):
+        return _of_machine(origin)
     folder = session_folder(origin)
     if folder is not None:
         session = load_session_to_plan(folder)
@@ -114,7 +116,11 @@ def subject_of(origin: str) -> StudySubject:
             f" {listed(sorted(catalogue()), 20)}",
             code="machine.unknown",
         )
-    machine = load_mechanism(origin, label=None)
+    return _of_machine(load_mechanism(origin, label=None))
+
+
+def _of_machine(machine: Machine) -> StudySubject:
+    """Subject with a machine and the built-in camera."""
     check_drawable(machine)
     return StudySubject(machine.name, Design(machine, (camera_of_size(BUILT_IN_CAMERA_SIZE),)))
 
