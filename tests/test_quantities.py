@@ -15,6 +15,7 @@ from pydantic import TypeAdapter
 from faults import raises
 from pkmcal.errors import InputError
 from pkmcal.files import Metres, Radians, Reading, Share, read_csv, written_unit
+from pkmcal.files.quantities import in_joint_units
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
 
 INCH = 0.0254
@@ -45,6 +46,18 @@ def test_millimetres_are_metres_to_the_last_digit(number, blank):
 def test_units_that_people_write(kind, text, value):
     assert TypeAdapter(kind).validate_python(text, strict=True) == pytest.approx(value, rel=1e-15)
     assert written_unit(text) is not None
+
+
+def test_units_of_a_machines_joints():
+    for value, units, number in (
+        (3e-6, ("rad",), 3e-6), ("3 um", ("m", "m"), 3e-6),
+        ("0.18 deg", ("m", "rad"), math.pi / 1000),
+    ):  # fmt: skip
+        assert in_joint_units(value, "m or rad", units, "x") == pytest.approx(number, rel=1e-15)
+    assert in_joint_units("60 rpm", "m/s or rad/s", ["rad"], "x") == pytest.approx(2 * math.pi)
+    for value, units in (("3 um", ["rad"]), ("1 deg", ["m"]), ("a", ["m"]), ("3e-6", ["m"])):
+        with raises(InputError, code="option.unit", where="x", found=value):
+            in_joint_units(value, "m or rad", units, "x")
 
 
 def scaled(node, where, path=()):
@@ -111,6 +124,22 @@ def test_a_machine_in_millimetres_and_degrees_is_the_same_machine(name, tmp_path
             {
                 "where": "m.yaml, line 16, legs[1].tubes[1].radius",
                 "found": "'3 dB'",
+                "expected": "metres, or a number with its unit, such as 269.3 mm",
+            },
+        ),
+        (
+            "3 px",  # of a screen, for the library of units
+            {
+                "where": "m.yaml, line 16, legs[1].tubes[1].radius",
+                "found": "'3 px'",
+                "expected": "metres, or a number with its unit, such as 269.3 mm",
+            },
+        ),
+        (
+            "3 mm/s",
+            {
+                "where": "m.yaml, line 16, legs[1].tubes[1].radius",
+                "found": "'3 mm/s'",
                 "expected": "metres, or a number with its unit, such as 269.3 mm",
             },
         ),

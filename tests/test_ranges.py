@@ -106,3 +106,20 @@ def test_numbers_of_the_other_functions(tmp_path, value):
     ):
         with raises(InputError, where=where, expected=f"a whole number, {limits}"):
             call()
+
+
+@pytest.mark.parametrize("value", [np.nan, -1.0, 1e308], ids=repr)
+def test_noises_and_distances_of_the_other_functions(tmp_path, value):
+    for call, where in (
+        (lambda: pkmcal.plan("3-rpr", edge_noise=value), "edge_noise"),
+        (lambda: pkmcal.plan("3-rpr", corner_noise=value), "corner_noise"),
+        (lambda: pkmcal.plan("3-rpr", joint_noise=value), "joint_noise"),
+        (lambda: pkmcal.plan("3-rpr", tracker=(1e-5, value)), "tracker"),
+        (lambda: pkmcal.plan("3-rpr", seed=value), "seed"),
+        (lambda: pkmcal.check(tmp_path, seed=value), "seed"),
+        (lambda: pkmcal.camera(tmp_path, distance=value), "distance"),
+        (lambda: pkmcal.servo("3-rpr", joint_noise=value), "joint_noise"),
+        (lambda: pkmcal.servo("3-rpr", speed=value), "speed"),
+    ):
+        with raises(InputError, where=where):
+            call()

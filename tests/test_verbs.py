@@ -202,6 +202,7 @@ def test_a_result_is_findings_a_document_and_a_summary(both):
     assert result.exit_code == result.outcome.exit_code
     assert result.summary().strip()
     assert "\x1b" not in result.summary()
+    assert len(repr(result)) < 1000
     if both.verb not in OWN_SUMMARY:
         assert result.outcome.verdict.headline.split()[0] in result.summary()
 
@@ -251,7 +252,7 @@ def test_a_result_opens_its_page(both, monkeypatch):
 
 FOR_OUTPUT = {"out", "as_json", "quiet", "force", "pictures", "no_browser", "port"}
 """Options of outputs, which are arguments of a result's ``save`` or ``show``."""
-OTHERWISE = {"model": "session", "size": "camera", "folder": "folder"}
+OTHERWISE = {"size": "camera", "folder": "folder"}
 """Options whose value becomes a part of an argument with another name."""
 
 
@@ -288,6 +289,56 @@ def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
     for name, argument in function.items():
         assert name in inspect.getdoc(getattr(pkmcal, verb))
         assert argument.annotation is not inspect.Parameter.empty
+
+
+# ------------------------------------------------------------------ arguments and results in memory
+
+
+@pytest.mark.parametrize("given", [None, 3, ["session"]], ids=repr)
+@pytest.mark.parametrize(
+    "call",
+    [
+        pkmcal.load_session, pkmcal.load_mechanism, pkmcal.load_camera, pkmcal.load_result,
+        pkmcal.check, pkmcal.calibrate, pkmcal.show, pkmcal.view,
+        lambda given: pkmcal.export(given, "json"), lambda given: pkmcal.diff(given, "3-rpr"),
+        lambda given: pkmcal.validate(given, "session"), lambda given: pkmcal.watch(given, "s"),
+        lambda given: pkmcal.servo(given),
+    ],
+)  # fmt: skip
+def test_an_argument_of_another_type_is_refused(call, given):
+    with raises(InputError, code="argument.not_a_path") as caught:
+        call(given)
+    assert type(given).__name__ in caught.value.found
+    assert caught.value.expected
+
+
+def test_a_result_in_memory_is_to_be_saved_where_a_folder_is_wanted(work):
+    result = pkmcal.calibrate(work / "first")
+    for call in (pkmcal.load_result, lambda it: pkmcal.export(it, "c"), pkmcal.show, pkmcal.view):
+        with raises(InputError, code="argument.not_a_path") as caught:
+            call(result)
+        assert "CalibrationResult" in caught.value.found
+        assert "save" in caught.value.next_step
+
+
+def test_loaded_calibrations_and_machines_stand_for_their_files(work):
+    saved, machine = pkmcal.load_result(work / "held"), pkmcal.load_mechanism("3-rpr")
+    assert saved.findings == saved.verdict.findings
+    loaded, there = pkmcal.export(saved, "json"), pkmcal.export(work / "held", "json")
+    assert loaded.files == there.files
+    assert pkmcal.show(saved).machine.name == saved.machine.name
+    (in_memory,), (by_name,) = (pkmcal.study(it, runs=2).found for it in (machine, "3-rpr"))
+    assert in_memory.position == by_name.position
+    assert pkmcal.servo(machine, legs=3, runs=1, duration=1).plan.runs == 1
+
+
+def test_arguments_of_other_shapes(work):
+    with raises(InputError, where="start", expected="T_base_platform (4, 4), m"):
+        pkmcal.servo("3-rpr", start=[0, 0, 0])
+    with raises(InputError, code="images.none"):
+        pkmcal.camera([])
+    with raises(InputError, where="model", found="design"):
+        pkmcal.calibrate(pkmcal.load_session(work / "first"), model="design")
 
 
 def test_a_simulated_session_is_not_copied_into_itself(tmp_path):

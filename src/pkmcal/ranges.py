@@ -16,15 +16,18 @@ from typing import Any, Literal
 
 from pkmcal.errors import InputError
 
+NO_LIMIT = 1e12
+"""A larger limit of a range is none in words."""
+
 
 @dataclass(frozen=True)
 class Range:
     """Interval from ``least`` to ``most``. Both ends are included, but ``least`` is excluded with
     ``above``.
 
-    whole : integers only. unit : of a number without one, ``m``, ``rad``, ``deg`` or ``m or rad``,
-    where one may be written; empty for numbers that take no unit. default : value of the option
-    that is not given; None if that is another rule than a number.
+    whole : integers only. unit : of a number without one, where one may be written, as for
+    :func:`pkmcal.files.quantities.read_with_unit`; empty for numbers that take no unit. default :
+    value of the option that is not given; None if that is another rule than a number.
     """
 
     least: float
@@ -34,8 +37,19 @@ class Range:
     default: float | None = None
     unit: str = ""
 
-    def __str__(self) -> str:
-        return f"{'over ' if self.above else ''}{self.least:g} to {self.most:g}"
+    @property
+    def plain_unit(self) -> str:
+        """Unit of a number without one in words, empty for shares and numbers that take no unit."""
+        return {"share": "", "1/s": "per s"}.get(self.unit, self.unit)
+
+    def text(self, factor: float = 1, unit: str | None = None) -> str:
+        """The interval in words. factor, unit : of another unit, relative to the interval's, and
+        its name.
+        """
+        name = self.plain_unit if unit is None else unit
+        most = "or more" if self.most > NO_LIMIT else f"to {self.most / factor:g}"
+        interval = f"{self.least / factor:g} {most} {name}"
+        return f"{'over ' if self.above else ''}{interval}".rstrip()
 
     def check(self, value: float, where: str) -> None:
         """Check a value; raise InputError unless it is a finite number (an integer with ``whole``)
@@ -49,8 +63,7 @@ class Range:
             "this number cannot be used",
             where=where,
             found=f"{value:g}" if isinstance(value, float) else repr(value),
-            expected=f"{'a whole number, ' if self.whole else ''}{self}"
-            f"{f' {self.unit}' if self.unit in ('m', 'rad', 'deg') else ''}",
+            expected=f"{'a whole number, ' if self.whole else ''}{self.text()}",
         )
 
 
@@ -96,21 +109,22 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
             "places": _whole(1, 12),
             "best_of": _whole(1, 100),
             # of painted legs and bare rods, by what shading leaves; polished legs are worse
-            "edge_noise": Range(0, 100, above=True, default=0.1),
-            "corner_noise": Range(0, 100, above=True, default=0.05),
+            "edge_noise": Range(0, 100, above=True, default=0.1, unit="px"),
+            "corner_noise": Range(0, 100, above=True, default=0.05, unit="px"),
+            "tracker": Range(0, 1, above=True),
             "joint_noise": Range(0, 1, above=True, default=GOOD_ENCODER_SIGMA, unit="m or rad"),
             "seed": _SEED,
         },
         "reproduce": {"runs": _whole(2, 100_000, 100), "seed": _SEED},
         "servo": {
             "runs": _whole(1, 1000, 60),
-            "gain": Range(0, 1000, above=True, default=1.0),
-            "rate": Range(0, 10_000, above=True, default=25.0),
+            "gain": Range(0, 1000, above=True, default=1.0, unit="1/s"),
+            "rate": Range(0, 10_000, above=True, default=25.0, unit="1/s"),
             "delay": _whole(0, 50, 1),
-            "noise": Range(0, 100, default=0.02),
+            "noise": Range(0, 100, default=0.02, unit="px"),
             "joint_noise": Range(0, 1, default=GOOD_ENCODER_SIGMA, unit="m or rad"),
-            "speed": Range(0, 1e6, above=True),
-            "duration": Range(0, 3600, above=True),
+            "speed": Range(0, 1e6, above=True, unit="m/s or rad/s"),
+            "duration": Range(0, 3600, above=True, unit="s"),
             "hand_position": Range(0, 100, default=0.03, unit="m"),
             "hand_rotation": Range(0, 180, default=3.0, unit="deg"),
             "seed": _SEED,
@@ -123,20 +137,20 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
             "tolerance": Range(0, 100, default=1.0),
             "joint_noise": Range(0, 1, above=True, unit="m or rad"),
             "noise": Range(0, 255, default=0.9),
-            "blur": Range(0, 20, default=0.6),
+            "blur": Range(0, 20, default=0.6, unit="px"),
             "rough_position": Range(0, 100),
             "rough_angle": Range(0, 3.2),
             "extreme": Range(0, 1),
             "breathing": Range(0, 1),
             "shake": Range(0, 1),
-            "warming": Range(0, 200, default=0.0),
+            "warming": Range(0, 200, default=0.0, unit="K"),
             "force": Range(0, 1e6, default=0.0),
             "seed": _SEED,
         },
         "study": {"runs": _whole(2, 1_000_000, 100), "seed": _SEED},
         "validate": {"regions": _whole(0, 1000, 0), "seed": _SEED},
         "view": {"port": _whole(0, 65_535, 0)},
-        "watch": {"alpha": Range(1e-6, 0.2, default=0.01), "seed": _SEED},
+        "watch": {"alpha": Range(1e-6, 0.2, default=0.01, unit="share"), "seed": _SEED},
     }
 )
 """Ranges by command and option. Lengths in m, angles in the option's own unit, noise of images in

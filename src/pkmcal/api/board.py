@@ -21,7 +21,7 @@ PDF_PRODUCER = b"/Producer (pkmcal)"
 """Mark of a page that pkmcal wrote, which may be replaced."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BoardResult(Result):
     """Page with a board.
 

@@ -11,11 +11,12 @@ from pkmcal.api.result import PAGE_DESCRIPTION, FolderResult
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.results import check_output
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
+from pkmcal.errors import InputError
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
 from pkmcal.ranges import CalibrationMethod, default
 from pkmcal.report.calibration import outcome_of, save
-from pkmcal.session.load import Session
+from pkmcal.session.load import Session, load_session
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -65,6 +66,7 @@ def calibrate(
     *,
     method: CalibrationMethod = "bundle",
     seed: int = 0,
+    model: str | None = None,
     refine_camera: bool = False,
     holdout: int = default("calibrate", "holdout"),
     progress: Progress | None = None,
@@ -80,6 +82,9 @@ def calibrate(
         ``linear`` ([B]), ``inverse-kinematic`` ([C]).
     seed :
         Seed of the random search for the stations' poses.
+    model :
+        One of the models that the mechanism file names, of a session's folder; by default the
+        file's own.
     refine_camera :
         Estimate the cameras' intrinsics as well, with their calibration's covariance as prior.
     holdout :
@@ -103,6 +108,16 @@ def calibrate(
 
     """
     with whole(progress, "Reading the session") as report:
+        if not isinstance(session, Session):
+            session = load_session(session, model)
+        elif model is not None:
+            raise InputError(
+                "the model of a loaded session is chosen when it is loaded",
+                where="model",
+                found=model,
+                next_step=f"Load it with pkmcal.load_session(folder, {model!r})",
+                code="option.not_applicable",
+            )
         calibration = calibrate_session(
             session,
             method=method,

@@ -15,7 +15,7 @@ from pkmcal.camera_calibration.image_files import board_file_of, image_files, se
 from pkmcal.errors import InputError
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
-from pkmcal.ranges import CameraModelChoice
+from pkmcal.ranges import CameraModelChoice, check_number
 from pkmcal.report.camera import outcome_of
 from pkmcal.wording import listed
 
@@ -111,6 +111,7 @@ def camera(
             found=unknown[0],
             expected=listed(list(OTHER_CAMERA_FILES)),
         )
+    check_number("camera", "distance", distance)
     with whole(progress, "Reading the board") as report:
         paths, described = _images_and_board(images, board)
         calibration = calibrate_images(paths, described, model, report, distance, bend=bend)

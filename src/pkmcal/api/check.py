@@ -11,10 +11,11 @@ from pkmcal.checks.check import check_session
 from pkmcal.checks.pictures import picture_names, with_pictures, write_pictures
 from pkmcal.checks.results import SessionCheck
 from pkmcal.checks.sentences import outcome_of
-from pkmcal.files import check_own_folder
+from pkmcal.files import check_own_folder, given_path
 from pkmcal.judge.repeatability import RepeatStudy, study_repeats
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, part, whole
+from pkmcal.ranges import check_number
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -95,6 +96,8 @@ def check(
         With ``repeat``, the session has no repeated images.
 
     """
+    check_number("check", "seed", seed)
+    session = given_path(session, "a session's folder")
     study = None
     with whole(progress, "Reading the session") as report:
         own = part(report, 0, 0.4 if repeat else 1)

@@ -11,13 +11,15 @@ from typing import Any
 
 from pkmcal.api.result import Result
 from pkmcal.calibration.machine_source import MachineSource, load_source
+from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.exporters.contract import Export, exporter_of, make_export, write_export
+from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Level, note
 from pkmcal.wording import brief, decimals, number, percent
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ExportResult(Result, Export):
     """Files for another program: ``files``, ``differences`` from the machine, ``notes``, and
     ``values`` under the program's own names.
@@ -103,7 +105,7 @@ class ExportResult(Result, Export):
 
 
 def export(
-    calibration: Path | str,
+    calibration: SavedCalibration | Machine | Path | str,
     to: str,
     *,
     session: Path | str | None = None,
@@ -114,7 +116,8 @@ def export(
     Parameters
     ----------
     calibration :
-        A calibration's folder, a mechanism file, or the name of a built-in machine.
+        A calibration's folder, a calibration loaded by :func:`pkmcal.load_result`, a machine, a
+        mechanism file, or the name of a built-in machine.
     to :
         Name of the format: ``c``, ``hangprinter``, ``json``, ``klipper``, ``linuxcnc``, ``marlin``,
         ``mujoco``, ``repetier``, ``reprap``, ``ros``, ``smoothie``, ``sdf``, ``urdf``, ``yaml``.

@@ -41,7 +41,7 @@ PROBED_FILE_DESCRIPTIONS = {
 IMAGES_DESCRIPTION = "where the images go"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class NewResult(Result):
     """Files of a new session.
 

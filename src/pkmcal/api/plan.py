@@ -15,6 +15,7 @@ from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, FolderResul
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
+from pkmcal.files.quantities import in_joint_units
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, part, whole
@@ -23,7 +24,7 @@ from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE, STATIONS_AROUND_A_MACHINE
 from pkmcal.planning.plan import MeasurementPlan, plan_measurements
 from pkmcal.planning.subject import Subject, as_it_stands, of_machine
-from pkmcal.ranges import default
+from pkmcal.ranges import check_number, default
 from pkmcal.report.plan import PLAN_STATIONS_FILE, PLAN_TABLE_FILE, outcome_of
 from pkmcal.session.load import Session, load_session_to_plan, session_folder
 from pkmcal.simulation import board_for
@@ -73,7 +74,7 @@ def plan(
     tracker: tuple[float, float | None] | None = None,
     edge_noise: float = default("plan", "edge_noise"),
     corner_noise: float = default("plan", "corner_noise"),
-    joint_noise: float = default("plan", "joint_noise"),
+    joint_noise: float | str = default("plan", "joint_noise"),
     seed: int = 0,
     progress: Progress | None = None,
 ) -> PlanResult:
@@ -112,7 +113,8 @@ def plan(
     edge_noise, corner_noise :
         Standard deviations of edges and of a board's corners without images, px.
     joint_noise :
-        Standard deviation of a reading, m or rad; machines only.
+        Standard deviation of a reading, m or rad, or a text with its unit, such as "3 um"; machines
+        only.
     seed :
         Seed for all random numbers.
     progress :
@@ -131,6 +133,11 @@ def plan(
         The subject or an option does not allow a plan.
 
     """
+    numbers = {"edge_noise": edge_noise, "corner_noise": corner_noise, "seed": seed}
+    for name, value in numbers.items():
+        check_number("plan", name, value)
+    for value in tracker or ():
+        check_number("plan", "tracker", value)
     folder = None if isinstance(subject, Session | Machine) else session_folder(str(subject))
     region, where = None, None
     with threadpool_limits(1, "blas"), whole(progress, "Reading the nominal model") as report:
@@ -154,7 +161,7 @@ def plan(
                 "a session", {"--after": after, "--same-place": same_place, "--best-of": best_of}
             )
             planned, where = _of_machine(
-                subject, camera, board, bool(places), tracker=tracker, joint_noise=joint_noise,
+                subject, camera, board, bool(places), joint_noise, tracker=tracker,
                 edge=edge_noise, corner=corner_noise, seed=seed,
             )  # fmt: skip
         choosing = partial(part(report, begin, 1), "Choosing configurations")
@@ -174,14 +181,18 @@ def _of_machine(
     camera: Camera | Path | str | tuple[int, int] | None,
     board: bool,
     places: bool,
+    joint_noise: float | str,
     **noise: Any,
 ) -> tuple[Subject, str]:
     """Machine with an assumed camera, and the location of its errors: the camera's or the machine's
     name as given.
 
-    places : whether stations are chosen. noise : of edges, corners, readings and the tracker.
+    places : whether stations are chosen. joint_noise, noise : of readings; of edges, corners and
+    the tracker.
     """
     machine = subject if isinstance(subject, Machine) else load_mechanism(str(subject))
+    reading = in_joint_units(joint_noise, "m or rad", machine.joint_units, "--joint-noise")
+    check_number("plan", "joint_noise", reading)
     name = machine.name if isinstance(subject, Machine) else str(subject)
     if camera is None or isinstance(camera, tuple):
         eye = camera_of_size(camera or PLANNED_IMAGE_SIZE)
@@ -194,6 +205,7 @@ def _of_machine(
             [eye] * (1 if one else STATIONS_AROUND_A_MACHINE),
             machine.joint_names,
             board=board_for(machine, "platform") if board else None,
+            joint_noise=reading,
             **noise,
         )
     except InputError as error:

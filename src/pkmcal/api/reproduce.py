@@ -26,7 +26,7 @@ def table_and_numbers(paper: str) -> Mapping[str, str]:
     return {f"paper-{paper}.md": "the table", f"paper-{paper}.json": NUMBERS_DESCRIPTION}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ReproductionResult(FolderResult):
     """Reproductions of papers. outcomes : by the paper's letter."""
 

@@ -17,6 +17,7 @@ from tempfile import mkdtemp
 from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
+from pkmcal.arrays import short_repr
 from pkmcal.files import check_own_folder, json_text, resolved, write_folder
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.finding import Finding
@@ -35,6 +36,8 @@ class Result(ABC):
     """Result of a function of :mod:`pkmcal`, with the text, the files and the JSON of its
     command.
     """
+
+    __repr__ = short_repr
 
     @classmethod
     def of(cls, value: Any, **more: Any) -> Self:

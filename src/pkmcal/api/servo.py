@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -11,11 +11,14 @@ import numpy as np
 
 from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.arrays import Array
+from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.control.laws import law_named
 from pkmcal.control.simulation import LoopSettings
 from pkmcal.control.source import load_plant
 from pkmcal.control.study import HAND_ROTATION, Plan, Study, study_servoing
 from pkmcal.errors import InputError
+from pkmcal.files.quantities import in_joint_units
+from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
 from pkmcal.placement.edges import EdgeNoise
@@ -40,7 +43,7 @@ class ServoResult(FolderResult, Study):
 
 
 def servo(
-    machine: Path | str,
+    machine: SavedCalibration | Machine | Path | str,
     *,
     session: Path | str | None = None,
     station: str | None = None,
@@ -52,8 +55,8 @@ def servo(
     rate: float = default("servo", "rate"),
     delay: int = default("servo", "delay"),
     noise: float = default("servo", "noise"),
-    joint_noise: float = default("servo", "joint_noise"),
-    speed: float | None = None,
+    joint_noise: float | str = default("servo", "joint_noise"),
+    speed: float | str | None = None,
     duration: float | None = None,
     hand_position: float = default("servo", "hand_position"),
     hand_rotation: float = HAND_ROTATION,
@@ -67,7 +70,8 @@ def servo(
     Parameters
     ----------
     machine :
-        A calibration's folder, a mechanism file, or the name of a built-in machine.
+        A calibration's folder, a calibration loaded by :func:`pkmcal.load_result`, a machine, a
+        mechanism file, or the name of a built-in machine.
     session :
         The calibration's session, for its cameras, where it is not found around the folder.
     station :
@@ -89,9 +93,9 @@ def servo(
     noise :
         Standard deviation of an edge's shift and tilt, px.
     joint_noise :
-        Standard deviation of a reading, m or rad.
+        Standard deviation of a reading, m or rad, or a text with its unit, such as "3 um".
     speed :
-        Largest speed of a drive, m/s or rad/s; by default unlimited.
+        Largest speed of a drive, m/s or rad/s, or a text with its unit; by default unlimited.
     duration :
         Duration of a run, s; by default 10 / gain.
     hand_position, hand_rotation :
@@ -116,20 +120,26 @@ def servo(
     """
     numbers = {
         "runs": runs, "gain": gain, "rate": rate, "delay": delay, "noise": noise,
-        "joint_noise": joint_noise, "speed": speed, "duration": duration,
-        "hand_position": hand_position, "hand_rotation": np.rad2deg(hand_rotation), "seed": seed,
+        "duration": duration, "hand_position": hand_position,
+        "hand_rotation": np.rad2deg(hand_rotation), "seed": seed,
     }  # fmt: skip
     for name, value in numbers.items():
         check_number("servo", name, value)
     law_named(law)
+    for name, given in (("start", start), ("goal", goal)):
+        if given is not None and np.shape(given) != (4, 4):
+            raise InputError(
+                "this is not a platform pose",
+                where=name,
+                found=f"an array of shape {np.shape(given)}",
+                expected="T_base_platform (4, 4), m",
+            )
     loop = LoopSettings(
         law=law,
         gain=gain,
         rate=rate,
         delay=delay,
         noise=EdgeNoise(shift=noise, tilt=noise),
-        joint_noise=joint_noise,
-        speed=None if speed is None else np.array([speed]),
         duration=10 / gain if duration is None else duration,
     )
     if loop.samples > MOST_SAMPLES:
@@ -137,16 +147,26 @@ def servo(
             "the runs would have too many samples", where="--duration",
             found=str(loop.samples), expected=f"at most {MOST_SAMPLES}, a rate times a duration",
         )  # fmt: skip
-    plan = Plan(loop, runs, seed, hand_position, hand_rotation, start, goal)
     with whole(progress, "Reading the machine") as report:
         plant = load_plant(
-            str(machine),
+            machine,
             session=None if session is None else Path(session),
             station=station,
             camera=None if camera is None else Path(camera),
-            legs=None if legs is None else tuple(number - 1 for number in legs),
+            legs=None if legs is None else tuple(int(number) - 1 for number in np.ravel(legs)),
             seed=seed,
         )
+        # the machine determines whether its joints have the units of these
+        units = plant.machine.joint_units
+        reading = in_joint_units(joint_noise, "m or rad", units, "--joint-noise")
+        check_number("servo", "joint_noise", reading)
+        loop = replace(loop, joint_noise=reading)
+        if speed is not None:
+            fastest = in_joint_units(speed, "m/s or rad/s", units, "--speed")
+            check_number("servo", "speed", fastest)
+            loop = replace(loop, speed=np.array([fastest]))
+        ends = [None if one is None else np.asarray(one, dtype=float) for one in (start, goal)]
+        plan = Plan(loop, runs, seed, hand_position, hand_rotation, *ends)
         try:
             return ServoResult.of(study_servoing(plant, plan, report))
         except (

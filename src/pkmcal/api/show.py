@@ -16,6 +16,7 @@ from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
+    from pkmcal.calibration.saved_calibration import SavedCalibration
     from pkmcal.web.document import MachineDocument
 
 
@@ -78,6 +79,18 @@ class MachineView:
             )
         write_text(path, self.html)
 
+    def show(self) -> Path:
+        """Write the page into a temporary folder, open it in a browser, and return its path."""
+        import webbrowser
+        from tempfile import mkdtemp
+
+        from pkmcal.files import resolved
+
+        page = resolved(Path(mkdtemp(prefix="pkmcal-"))) / "machine.html"
+        self.save(page)
+        webbrowser.open(page.as_uri())
+        return page
+
     def served(self) -> MachineDocument:
         """Document of a page that asks for its poses."""
         return self._document(sweeps=False)
@@ -96,19 +109,21 @@ class MachineView:
         return page_frame(self.html, self.machine.name)
 
 
-def show(source: Machine | Path | str) -> MachineView:
+def show(source: SavedCalibration | Machine | Path | str) -> MachineView:
     """Machine in 3-D with a slider for each joint reading, its zero and positive direction.
 
     Parameters
     ----------
     source :
         A machine, a built-in machine's name, a mechanism file, a session's folder (with its
-        cameras at their stations' poses) or a calibration's folder.
+        cameras at their stations' poses), a calibration's folder, or a calibration loaded by
+        :func:`pkmcal.load_result`.
 
     Returns
     -------
     MachineView
-        ``view.save("machine.html")``, ``view.document``; in a notebook it shows itself.
+        ``view.save("machine.html")``, ``view.show()``, ``view.document``; in a notebook it shows
+        itself.
 
     Raises
     ------
@@ -120,11 +135,12 @@ def show(source: Machine | Path | str) -> MachineView:
     """
     if isinstance(source, Machine):
         return MachineView(source, "A machine in memory")
-    folder = Path(source)
-    if (folder / "session.yaml").is_file() and not (folder / "calibration.json").is_file():
-        return _of_session(folder)
     from pkmcal.calibration.machine_source import load_source
 
+    if isinstance(source, Path | str):
+        folder = Path(source)
+        if (folder / "session.yaml").is_file() and not (folder / "calibration.json").is_file():
+            return _of_session(folder)
     loaded = load_source(source)
     state = "calibrated values" if loaded.calibrated else "nominal values"
     if not loaded.usable:

@@ -16,6 +16,7 @@ from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.files import closest, resolved, staged_folder
+from pkmcal.files.quantities import in_joint_units
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.outcome import Outcome, Verdict
 from pkmcal.outcome.finding import Finding, Level, finding, note
@@ -109,7 +110,7 @@ def simulate(
     on_platform: bool = False,
     noise: float = default("simulate", "noise"),
     blur: float = default("simulate", "blur"),
-    joint_noise: float | None = None,
+    joint_noise: float | str | None = None,
     plan: Path | str | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -134,7 +135,8 @@ def simulate(
     noise, blur :
         Standard deviations of a pixel's noise, grey levels, and of the lens's blur, px.
     joint_noise :
-        Standard deviation of a reading, m or rad; by default the plan's, or 3e-6.
+        Standard deviation of a reading, m or rad, or a text with its unit, such as "3 um"; by
+        default the plan's, or 3e-6.
     plan :
         Folder of a plan, whose machine, cameras, stations and configurations are simulated.
         Configurations that the true machine cannot take are left out, with a finding.
@@ -162,9 +164,7 @@ def simulate(
 
     """
     given: dict[str, Any] = {"sensor": Sensor(blur=blur, read_noise=noise), **settings}
-    _check_settings(
-        {**given, "noise": noise, "blur": blur, "joint_noise": joint_noise, "seed": seed}
-    )
+    _check_settings({**given, "noise": noise, "blur": blur, "seed": seed})
     planned = None if plan is None else rehearsal_of(plan)
     if planned:
         nominal = planned.machine
@@ -181,7 +181,9 @@ def simulate(
     given |= {"board": fixed, "board_on": place}
     if joint_noise is None:
         joint_noise = planned.joint_noise if planned else GOOD_ENCODER_SIGMA
-    setting = Settings(**given, joint_noise=joint_noise)
+    reading = in_joint_units(joint_noise, "m or rad", machine.joint_units, "--joint-noise")
+    check_number("simulate", "joint_noise", reading)
+    setting = Settings(**given, joint_noise=reading)
     eye = planned.cameras if planned else _camera(camera)
     with whole(progress, "Rendering") as report:
         truth = simulate_session(

@@ -12,6 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, FolderResult
+from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
 from pkmcal.papers.paper_a import study_subject
@@ -54,7 +55,7 @@ class StudyResult(SweepResult, FolderResult):
 
 
 def study(
-    subject: Path | str,
+    subject: Machine | Path | str,
     vary: Mapping[str, Value | Sequence[Value]] | Sequence[str] = (),
     *,
     runs: int = default("study", "runs"),
@@ -68,7 +69,7 @@ def study(
     Parameters
     ----------
     subject :
-        A session's folder, a mechanism file, a built-in machine, or ``a``: [A] 4.3.
+        A session's folder, a machine, a mechanism file, a built-in machine, or ``a``: [A] 4.3.
     vary :
         One value or several by name, or texts ``NAME=V1,V2``; every combination is simulated.
     runs :
@@ -101,11 +102,14 @@ def study(
     check_number("study", "runs", runs)
     check_number("study", "seed", seed)
     runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
-    studied = study_subject() if str(subject) == STUDIED_PAPER else subject_of(str(subject))
+    if str(subject) == STUDIED_PAPER:
+        studied = study_subject()
+    else:
+        studied = subject_of(subject if isinstance(subject, Machine) else str(subject))
     varied = parsed(studied, vary)
     cells = cells_of(studied, varied)
     settings = [cell.setting for cell in cells]
-    title = " ".join([str(subject), *vary])
+    title = " ".join([studied.name if isinstance(subject, Machine) else str(subject), *vary])
     names = [in_words(cell.values) for cell in cells]
     opened = nullcontext() if out is None else Store.opened(Path(out), title, settings, seed)
     with opened as store, whole(progress, "Simulating") as report:

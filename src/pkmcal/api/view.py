@@ -90,6 +90,8 @@ def view(source: Path | str, *, calibration: Path | str | None = None) -> View:
         There is nothing to view, or a file has a fault.
 
     """
+    from pkmcal.files import given_path
     from pkmcal.viewing.sources import source_of
 
-    return View(source_of(Path(source), None if calibration is None else Path(calibration)))
+    path = given_path(source, "a folder of a session, of a result or of several")
+    return View(source_of(path, None if calibration is None else Path(calibration)))

@@ -17,7 +17,7 @@ from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import camera_path, load_camera, written_camera
 from pkmcal.errors import InputError, legible
-from pkmcal.files import closest, resolved
+from pkmcal.files import closest, given_path, resolved
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
@@ -116,8 +116,11 @@ class MachineSource:
         return out
 
 
-def load_source(origin: Path | str, session: Path | None = None) -> MachineSource:
-    """Source from a calibration's folder, a mechanism file or the name of a built-in machine.
+def load_source(
+    origin: SavedCalibration | Machine | Path | str, session: Path | None = None
+) -> MachineSource:
+    """Source from a calibration or its folder, a machine, a mechanism file or the name of a
+    built-in machine.
 
     Raises InputError if ``origin`` is none of these.
 
@@ -127,19 +130,24 @@ def load_source(origin: Path | str, session: Path | None = None) -> MachineSourc
     calibration = loaded(origin)
     if isinstance(calibration, SavedCalibration):
         return _of_calibration(calibration, session)
-    built_in = str(origin) in catalogue()
-    return MachineSource(
-        calibration, origin=f"the built-in machine {origin}" if built_in else Path(origin).name
-    )
+    if isinstance(origin, Machine):
+        name = f"{origin.name} in memory"
+    elif str(origin) in catalogue():
+        name = f"the built-in machine {origin}"
+    else:
+        name = Path(str(origin)).name
+    return MachineSource(calibration, origin=name)
 
 
-def loaded(origin: Path | str) -> SavedCalibration | Machine:
-    """Calibration or machine from a folder, a file in it, a mechanism file or a built-in machine's
-    name.
+def loaded(origin: SavedCalibration | Machine | Path | str) -> SavedCalibration | Machine:
+    """Calibration or machine as it is, or from a folder, a file in it, a mechanism file or a
+    built-in machine's name.
 
     Raises InputError if ``origin`` is none of these.
     """
-    path = Path(origin)
+    if isinstance(origin, SavedCalibration | Machine):
+        return origin
+    path = given_path(origin, "a calibration's folder, a mechanism file or a machine's name")
     if str(origin) in catalogue() and not (path / CALIBRATION_DOCUMENT_FILE).is_file():
         return load_mechanism(str(origin))
     if (

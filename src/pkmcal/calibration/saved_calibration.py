@@ -28,7 +28,7 @@ from pkmcal.calibration.results import (
 from pkmcal.calibration.summary import CalibrationSummary, Overview
 from pkmcal.cameras.response import Response
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Schema, read_json, validated_document
+from pkmcal.files import Document, Schema, given_path, read_json, validated_document
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.estimate import Statistics
 from pkmcal.levels import ROUNDING
@@ -130,6 +130,11 @@ class SavedCalibration(CalibrationSummary):
         """Covariance (P, P) of the machine's parameters."""
         n = len(self.machine.parameters)
         return self.joint_covariance[:n, :n]
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings of the calibration; none of one from before findings had codes."""
+        return self.verdict.findings
 
     def overview(self) -> Overview:
         """Contents of the summary; older files may not have all of them."""
@@ -387,7 +392,7 @@ def load(source: Path | str) -> SavedCalibration:
 
     Raises InputError if there is none, or if it is inconsistent.
     """
-    document = _read(Path(source))
+    document = _read(given_path(source, "a calibration's folder"))
     saved = validated_document(document, _Saved)
     # consistency of machine, poses, readings and covariance
     mechanism = saved.mechanism

@@ -84,6 +84,10 @@ def image_files(images: Sequence[Path]) -> list[Path]:
 
 def board_file_of(images: Sequence[Path]) -> Path:
     """board.yaml in the folder of the images, or in the folder above; InputError without it."""
+    if not images:
+        raise InputError(
+            "no image is named", expected="images, or a folder of them", code="images.none"
+        )
     first = images[0] if images[0].is_dir() else images[0].parent
     for folder in (first, resolved(first).parent):
         if (folder / "board.yaml").is_file():

@@ -22,6 +22,7 @@ from pkmcal.files import (
     LARGEST_WRITTEN_FILE,
     Document,
     closest,
+    given_path,
     parse_yaml,
     quoted,
     read_text,
@@ -50,7 +51,7 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
         Any fault of the file, with its line.
 
     """
-    path, camera = camera_path(path)
+    path, camera = camera_path(given_path(path, "a camera's file"))
     label = label.removesuffix(f"#{camera}") if label else path.name
     text = _text_of(path, label)
     if is_visp(text):

@@ -33,7 +33,11 @@ pkmcal calibrate my-machine --refine-camera --seed 1 --json
     EXAMPLES,
     session(),
     choice("method", CalibrationMethod, "bundle, the joint estimate, or a method of the papers."),
-    option("--model", "NAME", "Model named in the mechanism file, such as design."),
+    option(
+        "--model",
+        "NAME",
+        "Model under models in the mechanism file, such as design. [default: the file's own ties]",
+    ),
     flag("--refine-camera", "Estimate the cameras' intrinsics as well."),
     number("calibrate", "holdout", "N", "Configurations left out and predicted."),
     seed("calibrate"),

@@ -23,9 +23,13 @@ pkmcal check my-machine --pictures drawn --seed 1
     session(),
     flag("--repeat", "Estimate the accuracy from repeated images as well."),
     seed("check"),
-    option("-o --out", "DIR", "Folder for a page with the images.", Path, group=OUTPUT_GROUP),
     option(
-        "--pictures", "DIR", "Folder for the images with the nominal model overlaid, as PNG.", Path,
+        "-o --out", "DIR", "Folder for a page with the images. [default: none is written]", Path,
+        group=OUTPUT_GROUP,
+    ),
+    option(
+        "--pictures", "DIR", "Folder for the images with the nominal model overlaid, as PNG."
+        " [default: none are written]", Path,
         group=OUTPUT_GROUP,
     ),
     as_json(),

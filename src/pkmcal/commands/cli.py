@@ -29,6 +29,8 @@ INTERRUPTED_EXIT = 130
 """Exit code that shells give to a program ended by Ctrl-C."""
 DEBUG_VARIABLE = "PKMCAL_DEBUG"
 
+WIDEST_HELP = 120
+"""Largest width of the help in characters; longer lines are hard to read."""
 SHELLS = ("bash", "zsh", "fish")
 """Shells that can complete commands and options."""
 
@@ -101,7 +103,7 @@ app = _Commands(
     "pkmcal",
     help="Calibrate parallel machines from images of their own legs.",
     epilog="Begin with: pkmcal demo. With your own machine: pkmcal new my-machine.",
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDEST_HELP},
     params=[
         click.Option(
             ["-V", "--version"],

@@ -9,21 +9,30 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable
 from contextlib import suppress
+from math import pi
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 
 from pkmcal.errors import InputError
-from pkmcal.ranges import RANGES, check_number
+from pkmcal.ranges import RANGES, Range
 
 OUTPUT_GROUP = "Output"
 """Heading of the options of outputs, the last in the help."""
-UNIT_EXAMPLES = {"m": "0.001 or 1 mm", "rad": "0.01 or 0.5 deg", "deg": "3 or 3 deg"}
-"""Numbers by the unit of one that has none."""
-OTHER_UNIT_EXAMPLES = "3e-6 or 3 um"
-MOST_IN_HELP = 1e12
-"""Limits above are not shown in the help."""
+UNIT_EXAMPLES = {
+    "m": "2 mm",
+    "rad": "30 deg",
+    "deg": "0.5 deg",
+    "m or rad": "3 um or 0.001 deg",
+    "m/s or rad/s": "100 mm/s or 30 deg/s",
+    "px": "0.5 px",
+    "s": "10 s",
+    "1/s": "25 Hz",
+    "K": "5 K",
+    "share": "1 %",
+}
+"""Numbers with a unit, by the unit of a number without one."""
 
 
 class _Option(click.Option):
@@ -42,6 +51,14 @@ class _Option(click.Option):
         if record is None or not self.earlier:
             return record
         return record[0].replace(f", {self.earlier}", ""), record[1]
+
+
+class _NumberOption(_Option):
+    """Option with a number in a range."""
+
+    def __init__(self, flags: list[str], group: str, allowed: Range, **settings: Any) -> None:
+        super().__init__(flags, group, type=str, **settings)
+        self.allowed = allowed
 
 
 class _Argument(click.Argument):
@@ -72,6 +89,18 @@ class Command(click.Command):
         for title, records in {**groups, OUTPUT_GROUP: last}.items():
             with formatter.section(title):
                 formatter.write_dl(records)
+        ranges = [one.allowed for one in self.params if isinstance(one, _NumberOption)]
+        if units := dict.fromkeys(one.unit for one in ranges if one.unit):
+            examples = " or ".join(UNIT_EXAMPLES[unit] for unit in units).split(" or ")
+            plain = " or ".join(one.plain_unit for one in ranges if one.plain_unit).split(" or ")
+            names = (
+                f" Without one they are in {', '.join(dict.fromkeys(plain))}." if plain[0] else ""
+            )
+            with formatter.section("Units"):
+                formatter.write_text(
+                    f"Numbers may have a unit, as in files: {', '.join(dict.fromkeys(examples))}."
+                    f"{names}"
+                )
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples as they are."""
@@ -159,7 +188,6 @@ def number(
 ) -> Any:
     """Numeric option, with its range, unit and default in :data:`pkmcal.ranges.RANGES`.
 
-    Lengths and angles may have a unit, such as ``0.1 deg``, as in files.
     flags : names; by default ``--name``. into : argument that it becomes; by default ``name``.
     usual : the default as text, if it is a rule.
     """
@@ -167,43 +195,46 @@ def number(
     words = flags.split() or [f"--{name.replace('_', '-')}"]
 
     def check(_context: Any, _parameter: Any, value: Any) -> Any:
-        if isinstance(value, str):
-            value = quantity(value, allowed.unit, words[-1])
-        check_number(command, name, value, words[-1])
-        return value
+        return value if value is None else parsed_number(value, allowed, words[-1])
 
-    facts = [str(allowed)] if allowed.most < MOST_IN_HELP else []
-    if allowed.unit:
-        facts.insert(0, f"such as {UNIT_EXAMPLES.get(allowed.unit, OTHER_UNIT_EXAMPLES)}")
+    # ranges of angles are shown in degrees
+    factor, unit = (pi / 180, "deg") if allowed.unit == "rad" else (1, None)
+    facts = [allowed.text(factor, unit)]
     if usual or allowed.default is not None:
-        facts.append(f"default: {usual or format(allowed.default, 'g')}")
-    return _Option(
-        [*words, into or name], group, metavar=metavar, callback=check, default=allowed.default,
-        type=str if allowed.unit else int if allowed.whole else float,
-        help=f"{described} [{'; '.join(facts)}]",
+        own = allowed.plain_unit if " or " not in allowed.plain_unit else ""
+        facts.append(f"default: {usual or f'{allowed.default:g} {own}'.rstrip()}")
+    return _NumberOption(
+        [*words, into or name], group, allowed, metavar=metavar, callback=check,
+        default=allowed.default, help=f"{described} [{'; '.join(facts)}]",
     )  # fmt: skip
 
 
-def quantity(text: str, unit: str, where: str) -> float:
-    """Number of an option, with or without a unit; InputError for another text.
+def parsed_number(text: str, allowed: Range, where: str) -> float | str:
+    """Number of an option, as in files with or without a unit; InputError for another text and for
+    a number outside the range.
 
-    unit : that of a number without one, m, rad, "m or rad" or deg. where : the option.
+    A text with a unit of a joint stays as it is, because only the machine determines whether its
+    joints have that unit. where : the option.
     """
-    with suppress(ValueError):
-        return float(text)  # such as every default: units are loaded for others alone
-    from pkmcal.files.quantities import read_quantity
+    with suppress(ValueError, InputError):
+        value = int(text) if allowed.whole else float(text)
+        allowed.check(value, where)
+        return value  # such as every default: units are loaded for others alone
+    example = f", such as {UNIT_EXAMPLES[allowed.unit]}" if allowed.unit else ""
+    expected = f"{'a whole number, ' if allowed.whole else ''}{allowed.text()}{example}"
+    if allowed.unit:
+        from pkmcal.files.quantities import read_with_unit
 
-    try:
-        return read_quantity(text, unit)
-    except ValueError:
-        kinds = {"m": "a length", "rad": "an angle", "deg": "an angle"}
-        raise InputError(
-            "this number cannot be used",
-            where=where,
-            found=text,
-            expected=f"{kinds.get(unit, 'a length or an angle')}, such as"
-            f" {UNIT_EXAMPLES.get(unit, OTHER_UNIT_EXAMPLES)}",
-        ) from None
+        with suppress(ValueError):
+            value, unit = read_with_unit(text, allowed.unit)
+            expected = allowed.text(unit.factor, unit.name) if unit else expected
+            with suppress(InputError):
+                allowed.check(value, where)
+                return text if " or " in allowed.unit else value
+    raise InputError(
+        "this number cannot be used", where=where, found=text.strip() or "nothing",
+        expected=expected,
+    )  # fmt: skip
 
 
 def seed(command: str) -> Any:
@@ -224,7 +255,10 @@ def calibration() -> Any:
 def cameras_session() -> Any:
     """Option of a calibration's session."""
     return option(
-        "--session", "DIR", "Session with the cameras, if it has moved since the calibration.", Path
+        "--session",
+        "DIR",
+        "Session with the cameras, if it has moved since the calibration. [default: where it was]",
+        Path,
     )
 
 

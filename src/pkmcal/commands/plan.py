@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from pkmcal.commands.options import (
 )
 from pkmcal.errors import InputError
 from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE
+from pkmcal.ranges import RANGES
 
 EXAMPLES = """\
 pkmcal plan my-machine
@@ -40,15 +42,19 @@ FOR_A_SESSION, FOR_A_MACHINE = "For a SESSION", "For a MACHINE"
         "plan", "configurations", "N", "Configurations for each station.",
         flags="-n --configurations", into="count",
     ),
-    number("plan", "places", "N", "Choose N stations as well."),
+    number("plan", "places", "N", "Choose N stations as well.",
+        usual="the session's, or 1 or 3"),
     flag(
         "--together/--apart", "All stations observe each configuration, or each its own."
         " [default: together with several cameras or a tracker]", default=None,
     ),
-    number("plan", "edge_noise", "PX", "Sigma of an edge without images, px."),
-    number("plan", "corner_noise", "PX", "Sigma of a board's corner without images, px."),
+    number("plan", "edge_noise", "PX", "Sigma of an edge without images."),
+    number("plan", "corner_noise", "PX", "Sigma of a board's corner without images."),
     seed("plan"),
-    number("plan", "best_of", "N", "Choose N of the session's stations.", group=FOR_A_SESSION),
+    number(
+        "plan", "best_of", "N", "Choose N of the session's stations.", usual="all",
+        group=FOR_A_SESSION,
+    ),
     option(
         "--after", "CALIBRATION", "Calibration to continue from. [default: the session's]", Path,
         group=FOR_A_SESSION,
@@ -57,7 +63,10 @@ FOR_A_SESSION, FOR_A_MACHINE = "For a SESSION", "For a MACHINE"
     flag(
         "--same-place", "The cameras have not moved since the calibration.", group=FOR_A_SESSION
     ),
-    option("--camera", "FILE", "Camera file.", Path, group=FOR_A_MACHINE),
+    option(
+        "--camera", "FILE", "Camera file. [default: a pinhole of --size]", Path,
+        group=FOR_A_MACHINE,
+    ),
     option(
         "--size", "WxH", "Image size without a camera file, px. [default: {}x{}]".format(
             *PLANNED_IMAGE_SIZE
@@ -66,10 +75,10 @@ FOR_A_SESSION, FOR_A_MACHINE = "For a SESSION", "For a MACHINE"
     flag("--board", "Observe a board on the platform.", group=FOR_A_MACHINE),
     option(
         "--tracker", "M[,RAD]", "Observe by a tracker or probe with this sigma, such as 20 um or"
-        " 20 um,0.005 deg.", group=FOR_A_MACHINE,
+        " 20 um,0.005 deg. [default: a camera observes]", group=FOR_A_MACHINE,
     ),
     number(
-        "plan", "joint_noise", "M", "Sigma of a joint reading, m or rad.", group=FOR_A_MACHINE
+        "plan", "joint_noise", "M", "Sigma of a joint reading.", group=FOR_A_MACHINE
     ),
     out("SESSION/plan, or plan"),
     as_json(),
@@ -102,17 +111,19 @@ def _tracker(text: str) -> tuple[float, float | None]:
     """Noise of a tracker, m and rad, from a text such as 2e-5 or 20 um,0.005 deg."""
     from pkmcal.files.quantities import read_quantity
 
-    parts = text.split(",")
-    try:
-        numbers = [read_quantity(*pair) for pair in zip(parts, ("m", "rad"), strict=False)]
-    except ValueError:
-        numbers = list[float]()
-    if len(numbers) != len(parts) or not all(0 < x < 1 for x in numbers):
-        raise InputError(
-            "this tracker noise cannot be used",
-            where="--tracker",
-            found=text,
-            expected="metres, and radians where it measures turns: 2e-5 or 2e-5,1e-4, or with"
-            " units: 20 um",
-        )
-    return numbers[0], numbers[1] if len(numbers) == 2 else None
+    parts, allowed = text.split(","), RANGES["plan"]["tracker"]
+    with suppress(ValueError, InputError):
+        numbers = [
+            read_quantity(part, unit) for part, unit in zip(parts, ("m", "rad"), strict=False)
+        ]
+        for one in numbers:
+            allowed.check(one, "--tracker")
+        if len(numbers) == len(parts):
+            return numbers[0], numbers[1] if len(numbers) == 2 else None
+    raise InputError(
+        "this tracker noise cannot be used",
+        where="--tracker",
+        found=text,
+        expected="metres, and radians where it measures turns, such as 20 um or 20 um,0.005 deg;"
+        f" {allowed.text()} each",
+    )

@@ -41,31 +41,34 @@ CAMERA, LOOP = "Camera", "Loop"
     ),
     cameras_session(),
     number("servo", "runs", "N", "Motions for each estimate of the geometry."),
-    number("servo", "duration", "S", "Duration of a run, s.", usual="10 / gain"),
+    number("servo", "duration", "S", "Duration of a run.", usual="10 / gain"),
     option("--start", "POSE", "Start of every run, x,y,z,rx,ry,rz in m and rad or with units."
         " [default: random]"),
-    option("--goal", "POSE", "Goal of every run, likewise."),
+    option("--goal", "POSE", "Goal of every run, likewise. [default: random]"),
     seed("servo"),
     option(
         "--station", "NAME", "Station whose camera controls. [default: the first]", group=CAMERA
     ),
-    option("--camera", "FILE", "Camera file. [default: the station's]", Path, group=CAMERA),
+    option(
+        "--camera", "FILE", "Camera file. [default: the station's, or a usual one]", Path,
+        group=CAMERA,
+    ),
     option("--legs", "1,2,3", "Legs that the camera observes. [default: all]", group=CAMERA),
     number(
-        "servo", "hand_position", "M", "Position error of the hand-placed camera, m.", group=CAMERA
+        "servo", "hand_position", "M", "Position error of the hand-placed camera.", group=CAMERA
     ),
     number(
-        "servo", "hand_rotation", "DEG", "Orientation error of the hand-placed camera, degrees.",
+        "servo", "hand_rotation", "DEG", "Orientation error of the hand-placed camera.",
         group=CAMERA,
     ),
     choice("law", ServoLaw, "Control by the legs' edges or directions.", group=LOOP),
-    number("servo", "gain", "G", "Share of the error corrected in a second, 1/s.", group=LOOP),
+    number("servo", "gain", "G", "Share of the error corrected in a second.", group=LOOP),
     number("servo", "rate", "HZ", "Images per second.", group=LOOP),
     number("servo", "delay", "N", "Delay from exposure to motion, in images.", group=LOOP),
-    number("servo", "noise", "PX", "Sigma of an edge's shift and tilt, px.", group=LOOP),
-    number("servo", "joint_noise", "M", "Sigma of a joint reading, m or rad.", group=LOOP),
+    number("servo", "noise", "PX", "Sigma of an edge's shift and tilt.", group=LOOP),
+    number("servo", "joint_noise", "M", "Sigma of a joint reading.", group=LOOP),
     number(
-        "servo", "speed", "V", "Largest speed of a drive, m/s or rad/s.", usual="unlimited",
+        "servo", "speed", "V", "Largest speed of a drive.", usual="unlimited",
         group=LOOP,
     ),
     out("servo"),

@@ -36,11 +36,11 @@ IMAGES, BOARD = "Images", "Board"
         "simulate", "tolerance", "X", "Standard deviation of the true geometry, in prior sigmas."
     ),
     number(
-        "simulate", "joint_noise", "M", "Sigma of a joint reading, m or rad.",
+        "simulate", "joint_noise", "M", "Sigma of a joint reading.",
         usual=f"the plan's, or {GOOD_ENCODER_SIGMA:g}",
     ),
     number(
-        "simulate", "warming", "K", "Warming of the machine over the session, kelvin; its"
+        "simulate", "warming", "K", "Warming of the machine over the session; its"
         " temperatures are then in joints.csv."
     ),
     number(
@@ -55,7 +55,7 @@ IMAGES, BOARD = "Images", "Board"
     option("--camera", "FILE", "Camera file, instead of --size.", Path, group=IMAGES),
     option("--size", "WxH", "Image size, px. [default: 800x600]", group=IMAGES),
     number("simulate", "noise", "GREY", "Sigma of a pixel, grey levels.", group=IMAGES),
-    number("simulate", "blur", "PX", "Sigma of the lens's blur, px.", group=IMAGES),
+    number("simulate", "blur", "PX", "Sigma of the lens's blur.", group=IMAGES),
     choice("finish", Style, "Surface of the legs; metal is polished.", group=IMAGES),
     choice("light", Light, "Light: soft from all sides, or hard.", group=IMAGES),
     flag("--as-built", "Add motors, collars and cables to the legs.", group=IMAGES),

@@ -43,11 +43,12 @@ Names of --vary, for the machine of paper A:
     ),
     option(
         "--vary", "NAME=V1,V2", "Values to combine with all others; one value sets it. Names are"
-        " listed below. [repeatable]", multiple=True,
+        " listed below. [repeatable; default: nothing varies]", multiple=True,
     ),
     number("study", "runs", "N", "Simulations for each combination."),
     seed("study"),
-    option("--scheduler", "ADDRESS", "Dask scheduler of a trusted cluster, such as tcp://host:8786."),
+    option("--scheduler", "ADDRESS", "Dask scheduler of a trusted cluster, such as tcp://host:8786."
+        " [default: this computer's cores]"),
     out("study", "Folder for the results and the finished batches."),
     as_json(),
     more=FURTHER_HELP,

@@ -33,7 +33,7 @@ pkmcal watch out today -o machine-history
     number("watch", "alpha", "P", "False-alarm probability."),
     option(
         "--same-place", "STATION", "Station whose camera has not moved since the calibration."
-        " [repeatable]", multiple=True,
+        " [repeatable; default: none]", multiple=True,
     ),
     seed("watch"),
     out("SESSION/watch", "Folder for the results; an earlier test there starts the run chart."),

@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.machine_source import MachineSource, load_source
-from pkmcal.calibration.saved_calibration import SavedCalibration, SavedStation, load
+from pkmcal.calibration.machine_source import MachineSource, load_source, loaded
+from pkmcal.calibration.saved_calibration import SavedCalibration, SavedStation
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.machine_view import machine_view
 from pkmcal.control.study import Plant, Uncertainty
 from pkmcal.errors import InputError
 from pkmcal.files.quantities import read_quantity
 from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import doubtful
 from pkmcal.placement.default_camera import default_camera
 from pkmcal.placement.stations import default_stations
@@ -31,7 +32,7 @@ CAMERA_POSITION = 2e-4
 
 
 def load_plant(
-    what: str,
+    what: SavedCalibration | Machine | Path | str,
     *,
     session: Path | None = None,
     station: str | None = None,
@@ -39,15 +40,17 @@ def load_plant(
     legs: tuple[int, ...] | None = None,
     seed: int = 0,
 ) -> Plant:
-    """Plant of a calibration's folder, of a mechanism file, or of a built-in machine.
+    """Plant of a calibration or its folder, of a machine, of a mechanism file, or of a built-in
+    machine.
 
     legs : numbers from 0. Raises InputError for any other source, for a station or camera that does
     not exist, and for legs that cannot be seen.
     """
     source = load_source(what, session)
     eye = load_camera(camera) if camera is not None else None
-    if source.calibrated:
-        return _of_calibration(load(what), source, station, eye, legs)
+    calibration = loaded(what)
+    if isinstance(calibration, SavedCalibration):
+        return _of_calibration(calibration, source, station, eye, legs)
     if station is not None or session is not None:
         raise InputError(
             "a machine that is not calibrated has no stations",

@@ -51,7 +51,7 @@ from pkmcal.files.quantities import (
     written_unit,
 )
 from pkmcal.files.refusals import next_step_after
-from pkmcal.files.regular import check_regular, resolved
+from pkmcal.files.regular import check_regular, given_path, resolved
 from pkmcal.files.schema import FieldError, Schema, validated_document
 from pkmcal.files.tables import CsvTable, PairTable, csv_text, read_csv, read_pairs
 from pkmcal.files.versions import versions
@@ -106,6 +106,7 @@ __all__ = [
     "digest_of",
     "entries",
     "field_path",
+    "given_path",
     "json_text",
     "json_value",
     "next_step_after",

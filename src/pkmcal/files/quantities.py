@@ -2,40 +2,56 @@
 
 A number without a unit is in metres, radians or parts of one. :data:`Metres`, :data:`Radians`,
 :data:`Share` and :data:`Reading` are the field types of a file's schema. In a table, the head of a
-column may name its unit, ``leg1 [mm]``.
+column may name its unit, ``leg1 [mm]``. Options of commands take units of px, time, temperature and
+speed as well.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from contextlib import suppress
 from decimal import Decimal
 from functools import cache, partial
-from math import degrees
+from math import radians
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import BeforeValidator
 
+from pkmcal.errors import InputError
 from pkmcal.files.documents import quoted
 from pkmcal.files.schema import FieldError
 
 LARGEST_UNITLESS_LENGTH = 50.0
 """Length (m) above which a number without a unit was written in millimetres."""
 _QUANTITY = re.compile(
-    r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%]{1,20})"
+    r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%][A-Za-zµμ°%/]{0,19})"
 )
 _HEAD = re.compile(r"(.*\S)\s*(?:\[([A-Za-zµμ°%]{1,20})\]|\(([A-Za-zµμ°%]{1,20})\))")
 SHARE_UNIT_NAMES = ("%", "percent", "ppm")
-_ROOTS = {"meter": "m", "radian": "rad", "dimensionless": ""}
+_ROOTS = {
+    "meter": "m",
+    "radian": "rad",
+    "dimensionless": "",
+    "pixel": "px",
+    "second": "s",
+    "1 / second": "1/s",
+    "kelvin": "K",
+    "meter / second": "m/s",
+    "radian / second": "rad/s",
+}
+KINDS_IN_FILES = ("m", "rad", "")
 _KINDS = {
     "m": ("a length", "metres", "269.3 mm"),
     "rad": ("an angle", "radians", "30 deg"),
     "": ("a share", "parts of one", "0.1 %"),
     "m or rad": ("a length or an angle", "metres or radians", "0.01 mm"),
 }
+_JOINT_EXAMPLES = {"m": "3 um", "rad": "0.001 deg", "m/s": "100 mm/s", "rad/s": "30 deg/s"}
 
 
 class Unit(NamedTuple):
-    """Factor of a unit to the SI unit ``kind``: "m", "rad" or "" (parts of 1).
+    """Factor of a unit to the SI unit ``kind``, such as "m", "rad" or "" (parts of 1).
 
     name : as it is written.
     """
@@ -45,11 +61,19 @@ class Unit(NamedTuple):
     name: str
 
 
-@cache
 def unit(name: str) -> Unit | None:
-    """Unit of a name such as mm, in, deg or %; None for units of other quantities."""
+    """Unit in files of a name such as mm, in, deg or %; None for units of other quantities."""
+    one = _any_unit(name)
+    return one if one and one.kind in KINDS_IN_FILES else None
+
+
+@cache
+def _any_unit(name: str) -> Unit | None:
+    """Unit of a name; None for units of quantities that are not in ``_ROOTS``."""
     import pint
 
+    if name == "px":  # the library's px is 1/96 inch
+        name = "pixel"
     try:
         factor, root = _registry().get_root_units(name)
     except (pint.PintError, AssertionError):  # the latter for single signs
@@ -109,13 +133,57 @@ def _read(kind: str, value: Any) -> Any:
 
 
 def read_quantity(text: str, unit_name: str) -> float:
-    """Number of a text, with or without a unit, in ``unit_name``: m, rad, "m or rad" or deg.
-
-    Raises ValueError for other texts.
+    """Number of a text, with or without a unit, in ``unit_name``; arguments and ValueError as for
+    :func:`read_with_unit`.
     """
-    if unit_name != "deg":
-        return float(_read(unit_name, text))
-    return float(text) if not _QUANTITY.fullmatch(text.strip()) else degrees(_read("rad", text))
+    return read_with_unit(text, unit_name)[0]
+
+
+def read_with_unit(text: str, unit_name: str) -> tuple[float, Unit | None]:
+    """Number of a text in ``unit_name``, and the unit that is written, with its factor to
+    ``unit_name``; None for a number without a unit.
+
+    unit_name : px, s, 1/s, K, share, deg, a kind of :class:`Unit`, or several with "or" between.
+    Raises ValueError for a text that is no number, or has another unit.
+    """
+    match = _QUANTITY.fullmatch(text.strip())
+    if not match:
+        return float(text), None
+    kinds = {"share": [""], "deg": ["rad"]}.get(unit_name) or unit_name.split(" or ")
+    stated_unit = _any_unit(match[2])
+    if stated_unit is None or stated_unit.kind not in kinds:
+        raise ValueError(f"{match[2]} is not a unit of {unit_name}")
+    factor = stated_unit.factor / (radians(1) if unit_name == "deg" else 1)
+    # decimal arithmetic, so that 269.3 mm equals 0.2693
+    number = float(Decimal(match[1]) * Decimal(repr(factor)))
+    return number, Unit(factor, stated_unit.kind, match[2])
+
+
+def in_joint_units(
+    value: float | str, unit_name: str, joint_units: Sequence[str], where: str
+) -> float:
+    """Number in ``unit_name``, "m or rad" or "m/s or rad/s", of a value for a machine's joints.
+
+    value : a number, which is returned, or a text with a unit. joint_units : "m" or "rad" of each
+    joint. where : option in the message. Raises InputError for a text without a unit, or with one
+    that no joint has.
+    """
+    if not isinstance(value, str):
+        return value
+    per_second = unit_name.removeprefix("m").partition(" ")[0]
+    names = list(dict.fromkeys(f"{one}{per_second}" for one in joint_units))
+    with suppress(ValueError):
+        number, stated_unit = read_with_unit(value, " or ".join(names))
+        if stated_unit:
+            return number
+    raise InputError(
+        "this number cannot be used for this machine's joints",
+        where=where,
+        found=value,
+        expected=f"a number in {' or '.join(names)}, or with its unit, such as"
+        f" {' or '.join(_JOINT_EXAMPLES[name] for name in names)}",
+        code="option.unit",
+    )
 
 
 Metres = Annotated[float, BeforeValidator(partial(_read, "m"))]

@@ -24,6 +24,23 @@ def resolved(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def given_path(value: object, expected: str) -> Path:
+    """Path of an argument of a public function; InputError for an object of another type.
+
+    expected : what the path is of, such as "a session's folder".
+    """
+    if isinstance(value, str | Path):
+        return Path(value)
+    in_memory = hasattr(value, "save")
+    raise InputError(
+        "this is not a path",
+        found=f"an object of type {type(value).__name__}",
+        expected=expected,
+        next_step="Save it with save(FOLDER), and name that folder" if in_memory else None,
+        code="argument.not_a_path",
+    )
+
+
 def check_regular(path: Path, label: str) -> None:
     """Raise `InputError` where `path` exists and is not a regular file, before it is opened.
 

@@ -197,7 +197,7 @@ def difference(
 
 
 def _compared_machine(origin: SavedCalibration | Machine | Path | str) -> ComparedMachine:
-    calibration = loaded(origin) if isinstance(origin, Path | str) else origin
+    calibration = loaded(origin)
     if isinstance(calibration, SavedCalibration):
         name = str(origin) if isinstance(origin, Path | str) else str(calibration.path.parent)
         return ComparedMachine(name, calibration.machine, calibration)

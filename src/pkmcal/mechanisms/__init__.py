@@ -19,6 +19,7 @@ from pkmcal.files import (
     Document,
     any_unit,
     closest,
+    given_path,
     read_yaml,
     validated_document,
     yaml_text,
@@ -86,7 +87,7 @@ def load_mechanism(
 
     """
     built_in = catalogue()
-    path = built_in.get(str(source), Path(source))
+    path = built_in.get(str(source)) or given_path(source, "a mechanism file or a machine's name")
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         guess = closest(str(source), built_in)
         raise InputError(

@@ -34,6 +34,7 @@ from pkmcal.files import (
     check_count,
     check_regular,
     closest,
+    given_path,
     json_text,
     no_such,
     quoted,
@@ -322,7 +323,7 @@ def load_session(
 
     """
     # Session file and machine.
-    folder, document = _session_document(Path(folder))
+    folder, document = _session_document(given_path(folder, "a session's folder"))
     schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model, held=False)
     # Joint readings.

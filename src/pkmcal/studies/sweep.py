@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -21,6 +22,7 @@ from pkmcal.cameras import Camera, camera_models, load_camera
 from pkmcal.cameras.contract import FOCAL
 from pkmcal.errors import InputError
 from pkmcal.files import closest
+from pkmcal.files.quantities import read_quantity
 from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechanism
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.outcome.finding import Finding, note
@@ -93,11 +95,13 @@ def in_words(values: Mapping[str, Value]) -> str:
     )
 
 
-def subject_of(origin: str) -> StudySubject:
-    """Subject by a session's folder, a mechanism file or a built-in machine's name.
+def subject_of(origin: Machine | str) -> StudySubject:
+    """Subject by a machine, a session's folder, a mechanism file or a built-in machine's name.
 
     Raises InputError if the origin is none of these.
     """
+    if isinstance(origin, Machine):
+        return _of_machine(origin)
     folder = session_folder(origin)
     if folder is not None:
         session = load_session_to_plan(folder)
@@ -112,7 +116,11 @@ def subject_of(origin: str) -> StudySubject:
             f" {listed(sorted(catalogue()), 20)}",
             code="machine.unknown",
         )
-    machine = load_mechanism(origin, label=None)
+    return _of_machine(load_mechanism(origin, label=None))
+
+
+def _of_machine(machine: Machine) -> StudySubject:
+    """Subject with a machine and the built-in camera."""
     check_drawable(machine)
     return StudySubject(machine.name, Design(machine, (camera_of_size(BUILT_IN_CAMERA_SIZE),)))
 
@@ -198,7 +206,11 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
             raise InputError(
                 "a value is missing", where="--vary", found=text, expected=f"{name}=V1,V2"
             )
-        values = [_value(name, subject.names[name], part) for part in parts]
+        varied = subject.names[name]
+        unit = {"°": "deg"}.get(varied.unit, varied.unit)
+        if unit == "m or rad" and isinstance(subject.design, Design):
+            unit = " or ".join(dict.fromkeys(subject.design.machine.joint_units))
+        values = [_value(name, varied, unit, part) for part in parts]
         if len(set(values)) < len(values):
             raise InputError(
                 "a value occurs twice", where="--vary", found=text, code="study.value_twice"
@@ -207,17 +219,16 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
     return out
 
 
-def _value(name: str, varied: Varied, text: str) -> Value:
-    """One value of a name, validated."""
+def _value(name: str, varied: Varied, unit: str, text: str) -> Value:
+    """One value of a name, validated. unit : of a number, as for :func:`read_quantity`."""
     if varied.words:
         if text in varied.words or (name == "camera" and Path(text).is_file()):
             return text
         expected = listed(varied.words) + (" or a camera's file" if name == "camera" else "")
         raise InputError(f"no such {name}", where="--vary", found=text, expected=expected)
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = math.nan
+    with suppress(ValueError):
+        value = read_quantity(text, unit)
     good = varied.least <= value <= varied.most and not (varied.whole and value % 1)
     if not good:
         most = f" to {varied.most:g}" if math.isfinite(varied.most) else " or more"
@@ -226,7 +237,7 @@ def _value(name: str, varied: Varied, text: str) -> Value:
             where="--vary",
             found=text,
             expected=("a whole number of " if varied.whole else "")
-            + f"{varied.least:g}{most} {varied.unit}".rstrip(),
+            + f"{varied.least:g}{most} {unit}".rstrip(),
         )
     return int(value) if varied.whole else value
 
