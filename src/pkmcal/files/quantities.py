@@ -108,8 +108,11 @@ def _read(kind: str, value: Any) -> Any:
     return float(Decimal(match[1]) * Decimal(repr(stated_unit.factor)))
 
 
+READABLE_UNITS = ("m", "rad", "m or rad", "deg")
+
+
 def read_quantity(text: str, unit_name: str) -> float:
-    """Number of a text, with or without a unit, in ``unit_name``: m, rad, "m or rad" or deg.
+    """Number of a text, with or without a unit, in ``unit_name``, one of ``READABLE_UNITS``.
 
     Raises ValueError for other texts.
     """

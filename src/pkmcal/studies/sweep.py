@@ -21,6 +21,7 @@ from pkmcal.cameras import Camera, camera_models, load_camera
 from pkmcal.cameras.contract import FOCAL
 from pkmcal.errors import InputError
 from pkmcal.files import closest
+from pkmcal.files.quantities import READABLE_UNITS, read_quantity
 from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechanism
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.outcome.finding import Finding, note
@@ -31,7 +32,7 @@ from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
 from pkmcal.studies.tasks import StudySetting
 from pkmcal.studies.varied import DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED, Varied
-from pkmcal.wording import listed
+from pkmcal.wording import DISPLAY_UNITS, listed, with_unit
 
 STUDIED_PAPER = "a"
 MOST_CELLS = 500
@@ -74,6 +75,35 @@ class StudySubject:
         """Names that can be varied."""
         return DESIGN_NAMES_VARIED if isinstance(self.design, Design) else PAPER_NAMES_VARIED
 
+    def unit_of(self, name: str) -> str:
+        """Unit of a name's numbers: m or rad alone where all readings of the machine are of a
+        kind.
+        """
+        unit = self.names[name].unit
+        if unit == "m or rad" and isinstance(self.design, Design):
+            kinds = set(self.design.machine.joint_units)
+            return kinds.pop() if len(kinds) == 1 else unit
+        return unit
+
+    def display_unit(self, name: str) -> tuple[float, str]:
+        """Factor and unit in which a name's numbers are shown: mm or degrees for readings."""
+        unit = self.unit_of(name)
+        return (1.0, unit) if unit == self.names[name].unit else DISPLAY_UNITS[unit]
+
+    def value_text(self, name: str, value: Value) -> str:
+        """A value of a name with its unit."""
+        factor, unit = self.display_unit(name)
+        return value if isinstance(value, str) else with_unit(f"{value * factor:g}", unit).rstrip()
+
+    def in_words(self, values: Mapping[str, Value]) -> str:
+        """Description of a combination, such as "stations 2, edge noise 0.1 px"; empty if nothing
+        varies.
+        """
+        return ", ".join(
+            f"{name.replace('_', ' ')} {self.value_text(name, value)}"
+            for name, value in values.items()
+        )
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -81,16 +111,6 @@ class Cell:
 
     values: Mapping[str, Value]
     setting: SweptSetting
-
-
-def in_words(values: Mapping[str, Value]) -> str:
-    """Description of a combination, such as "stations 2, edge noise 0.1"; empty if nothing
-    varies.
-    """
-    return ", ".join(
-        f"{name.replace('_', ' ')} {value if isinstance(value, str) else f'{value:g}'}"
-        for name, value in values.items()
-    )
 
 
 def subject_of(origin: str) -> StudySubject:
@@ -198,7 +218,7 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
             raise InputError(
                 "a value is missing", where="--vary", found=text, expected=f"{name}=V1,V2"
             )
-        values = [_value(name, subject.names[name], part) for part in parts]
+        values = [_value(name, subject.names[name], subject.unit_of(name), part) for part in parts]
         if len(set(values)) < len(values):
             raise InputError(
                 "a value occurs twice", where="--vary", found=text, code="study.value_twice"
@@ -207,15 +227,16 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
     return out
 
 
-def _value(name: str, varied: Varied, text: str) -> Value:
-    """One value of a name, validated."""
+def _value(name: str, varied: Varied, unit: str, text: str) -> Value:
+    """One value of a name, validated; in ``unit`` if it has none of its own."""
     if varied.words:
         if text in varied.words or (name == "camera" and Path(text).is_file()):
             return text
         expected = listed(varied.words) + (" or a camera's file" if name == "camera" else "")
         raise InputError(f"no such {name}", where="--vary", found=text, expected=expected)
+    readable = {"°": "deg"}.get(unit, unit)
     try:
-        value = float(text)
+        value = read_quantity(text, readable) if readable in READABLE_UNITS else float(text)
     except ValueError:
         value = math.nan
     good = varied.least <= value <= varied.most and not (varied.whole and value % 1)
@@ -226,7 +247,7 @@ def _value(name: str, varied: Varied, text: str) -> Value:
             where="--vary",
             found=text,
             expected=("a whole number of " if varied.whole else "")
-            + f"{varied.least:g}{most} {varied.unit}".rstrip(),
+            + f"{varied.least:g}{most} {unit}".rstrip(),
         )
     return int(value) if varied.whole else value
 
