@@ -308,12 +308,14 @@ def _coverage_part(study: SweepResult) -> Part:
 
 
 def _kind(name: str) -> str:
-    """Kind of a parameter: its name without leg and coordinate."""
+    """Kind of a parameter in words: its name without leg and coordinate."""
     if "]" not in name:  # [A]'s: A2 x, q5
         return {"A": "base centres", "B": "platform centres"}.get(name[:1], "offsets")
     rest = name.partition("].")[2]
     rest = rest.removesuffix(".x").removesuffix(".y").removesuffix(".z")
-    return "tubes.radius" if rest.startswith("tubes") else rest
+    if rest.startswith("tubes"):
+        return "tube radius"
+    return rest.replace("center", "centre").replace(".", " ")
 
 
 # ------------------------------------------------------------------ plots
