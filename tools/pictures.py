@@ -97,12 +97,11 @@ def result(case: Case) -> Shot:
     html = guide.parts_page(
         image,
         geometry,
-        style=".report { padding-top: 0; }"
-        " main { display: grid; grid-template-columns: 640px 470px; gap: 22px; padding: 8px; }"
+        style="main { display: grid; grid-template-columns: 640px 470px; gap: 22px; padding: 8px; }"
         " main h2, .bar, .hint, .images-bar, .space-block figcaption { display: none !important; }"
         " .space-block .space-stage { height: 480px; }",
     )
-    return Shot(html, 1180, 530)
+    return Shot(html, 1180, 542)
 
 
 def outward(case: Case) -> Array:

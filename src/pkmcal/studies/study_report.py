@@ -353,17 +353,17 @@ def _curve(study: SweepResult, name: str, groups: list[tuple[str, list[CellFindi
     where there are too many, one of the means.
     """
     values, (factor, unit) = study.varied[name], study.subject.display_unit(name)
-    shown = [value if isinstance(value, str) else factor * value for value in values]
-    x = _value_axis(_name(name) + (f", {unit}" if unit else ""), shown)
+    display_values = [value if isinstance(value, str) else factor * value for value in values]
+    x = _value_axis(_name(name) + (f", {unit}" if unit else ""), display_values)
     marks: list[Mark] = []
     if len(groups) > MOST_LINES:
         means = [study.at(name, value) for value in values]
-        marks += _series(study, name, x, shown, "all else together", "calibrated", means)
+        marks += _series(study, name, x, display_values, "all else together", "calibrated", means)
     else:
         for k, (of, cells) in enumerate(groups):
             colour, stated = leg_colour(k + 1), [cell.position_sigma for cell in cells]
             errors = [cell.with_usable_error(cell.position) for cell in cells]
-            marks += _series(study, name, x, shown, of, colour, errors, stated)
+            marks += _series(study, name, x, display_values, of, colour, errors, stated)
     points = [p for mark in marks if isinstance(mark, DotsMark) for p in mark.points]
     ends = [v for p in points for v in (p.y, p.high) if isinstance(v, float)]
     return Plot(
@@ -383,7 +383,7 @@ def _series(
     study: SweepResult,
     name: str,
     x: PlotAxis,
-    shown: Sequence[float | str],
+    display_values: Sequence[float | str],
     of: str,
     colour: Colour,
     errors: list[Summary],
@@ -391,12 +391,12 @@ def _series(
 ) -> Iterator[Mark]:
     """Dots of the errors at each value of a name, and crosses of the stated standard deviations.
 
-    shown : the values in the unit of the axis. of : combination of the other values, in words;
-        empty without any.
+    display_values : the values in the unit of the axis.
+    of : combination of the other values, in words; empty without any.
     """
     dots, crosses = list[Point](), list[Point]()
     for k, (value, error) in enumerate(zip(study.varied[name], errors, strict=True)):
-        at = _category(shown[k]) if x.scale == "categories" else shown[k]
+        at = _category(display_values[k]) if x.scale == "categories" else display_values[k]
         where = study.subject.value_text(name, value) + (f", {of}" if of else "")
         if np.isfinite(error.value):
             reach = 2 * error.error if np.isfinite(error.error) else 0.0
