@@ -126,6 +126,11 @@ def test_every_height_before_and_after(kit, true):
     order = np.argsort(-np.abs(after / sigma))
     assert names == [heights[k]["configuration"] for k in order]
     assert [row["cells"][-1] for row in table["rows"]] == ["worst"] + 18 * ["used"]
+    (maps,) = (block["plots"] for block in part["blocks"] if block["kind"] == "panels")
+    for each, errors in zip(maps, (before, after), strict=True):
+        points = each["marks"][0]["points"]
+        np.testing.assert_allclose([p["value"] for p in points], 1e3 * errors, atol=1e-3)
+    assert maps[0]["colours"]["limits"] == maps[1]["colours"]["limits"]
     text = run("calibrate", kit, "-o", kit.parent / "again").out
     assert f"{names[0]} at x" in text
 

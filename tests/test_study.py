@@ -33,7 +33,7 @@ from pkmcal.studies.findings import SweepResult, clustered, with_error
 from pkmcal.studies.statistics import Summary, covered
 from pkmcal.studies.store import plainly
 from pkmcal.studies.study_report import study_document
-from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
+from pkmcal.studies.sweep import cells_of, parsed, scaled, subject_of
 from pkmcal.studies.varied import DESIGN_NAMES_VARIED
 from pkmcal.wording import brief
 
@@ -85,6 +85,31 @@ def test_a_grid_has_every_combination():
 def test_what_cannot_be_varied_is_reported(words, facts):
     with raises(InputError, where="--vary", **facts):
         parsed(subject_of("3-rpr"), words)
+
+
+@pytest.mark.parametrize(
+    ("machine", "words", "value", "text"),
+    [
+        ("3-rpr", "play=0.1 mm", 1e-4, "play 0.1 mm"),
+        ("3-rpr", "reading-noise=3e-6", 3e-6, "reading noise 0.003 mm"),
+        ("delta", "play=0.1 deg", np.deg2rad(0.1), "play 0.1°"),
+        ("delta", "distance=40 cm", 0.4, "distance 0.4 m"),
+        ("delta", "elevation=0.5 rad", np.rad2deg(0.5), "elevation 28.6479°"),
+        ("a", "reading_noise=3 um", 3e-6, "reading noise 3e-06 m"),
+    ],
+)
+def test_values_with_units(machine, words, value, text):
+    """Readings are shown in mm or degrees, by the machine's joints."""
+    subject = study_subject() if machine == "a" else subject_of(machine)
+    varied = parsed(subject, [words])
+    assert [*varied.values()] == [(pytest.approx(value),)]
+    assert subject.in_words({name: values[0] for name, values in varied.items()}) == text
+
+
+@pytest.mark.parametrize(("machine", "words"), [("3-rpr", "play=1 deg"), ("delta", "play=1 mm")])
+def test_a_reading_in_the_unit_of_another_joint_is_refused(machine, words):
+    with raises(InputError, where="--vary", found=words.partition("=")[2]):
+        parsed(subject_of(machine), [words])
 
 
 def test_names_that_can_be_varied_are_listed():
@@ -385,7 +410,7 @@ def test_calibrations_that_all_fail_are_reported(tmp_path, one_process):
     plots = [plot for block in page_blocks(document, "panels") for plot in block["plots"]]
     assert [plot["name"] for plot in plots] == ["by-axis-noise", "held"]
     (error,) = (mark for mark in plots[0]["marks"] if mark["name"] == "error")
-    assert [point["x"] for point in error["points"]] == ["1.0"]
+    assert [point["x"] for point in error["points"]] == ["1"]
 
 
 def test_a_platform_that_does_not_turn_has_no_rotations_in_its_table(tmp_path, one_process):
@@ -415,7 +440,7 @@ def test_parameters_keep_their_names_where_legs_and_boards_are_compared(one_proc
     head, *lines = results.summary().splitlines()
     assert head == f"{results.subject.name}, 2 calibrations a combination"
     for line, cell in zip(lines, results.found, strict=True):
-        assert line.startswith(f"  {in_words(cell.values)}: tool ")
+        assert line.startswith(f"  {results.subject.in_words(cell.values)}: tool ")
         assert f"stated {brief(1e3 * cell.position_sigma)} mm, " in line
 
 

@@ -573,6 +573,15 @@ def test_validate_on_what_was_held_out(saved_result, demo):
     assert worst["key"] == f"configuration:{worst['x']}"
     (sentence, *_) = page_blocks(page, "paragraph", "readings")
     assert f"Worst is configuration {worst['x']}," in sentence["text"]
+    # the stage and the table begin there
+    (stage,) = page_blocks(page, "space", "configurations")
+    (table,) = page_blocks(page, "table", "configurations")
+    keys = [pose["key"] for pose in stage["poses"]]
+    assert keys[0] == worst["key"]
+    assert keys == [row["key"] for row in table["rows"]]
+    (points,) = stage["points"]
+    assert list(points["keys"]) == keys
+    assert points["sizes"][0] == max(points["sizes"]) == 1
     assert json.loads((saved_result.folder / "v" / "validation.json").read_text())["new_data"]
     del demo
 

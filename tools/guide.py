@@ -153,7 +153,8 @@ def parts_page(*parts: Part, style: str = "") -> str:
     opened = tuple(replace(part, expert=False) for part in parts)
     outcome = Outcome(command="", title="", verdict=Verdict(True, ""), parts=opened)
     own = (
-        "<style>.report { display: block; } .top, .contents, .verdict { display: none !important; }"
+        "<style>.report { display: block; padding-top: 12px !important; }"
+        " .top, .contents, .verdict { display: none !important; }"
         f" {style}</style>"
     )
     # instead of the policy, which allows no other style

@@ -98,10 +98,10 @@ def result(case: Case) -> Shot:
         image,
         geometry,
         style="main { display: grid; grid-template-columns: 640px 470px; gap: 22px; padding: 8px; }"
-        " main h2, .bar, .images-bar, .space-block figcaption { display: none !important; }"
+        " main h2, .bar, .hint, .images-bar, .space-block figcaption { display: none !important; }"
         " .space-block .space-stage { height: 480px; }",
     )
-    return Shot(html, 1180, 530)
+    return Shot(html, 1180, 542)
 
 
 def outward(case: Case) -> Array:
@@ -162,7 +162,7 @@ def residuals(case: Case) -> Shot:
         residual_plots.by_leg(case.session, edges, estimate),
     )
     html = guide.parts_page(Part("residuals", "", blocks=plots), style="main h2 { display: none; }")
-    return Shot(html, 900, 300)
+    return Shot(html, 900, 310)
 
 
 def repeats(case: Case) -> Shot:
@@ -302,7 +302,8 @@ def plan(_case: Case) -> Shot:
     subject = of_machine(machine, [default_camera()], machine.joint_names)
     outcome = outcome_of(make_plan(subject, free_stations=3))
     (where,) = (part for part in outcome.parts if part.name == "where")
-    return Shot(guide.parts_page(where), 1000, 690)
+    html = guide.parts_page(where, style="main h2 { display: none; }")
+    return Shot(html, 1000, 690)
 
 
 def view(case: Case) -> Shot:
@@ -317,7 +318,7 @@ def tutorial_images(case: Case) -> Shot:
 
 def tutorial_check(case: Case) -> Shot:
     """The nominal model over one of them, at the rough and at the localized pose."""
-    return Shot(guide.laid_over(guide.session(case.work)), 1000, 410)
+    return Shot(guide.laid_over(guide.session(case.work)), 1000, 420)
 
 
 def tutorial_report(case: Case) -> Shot:
@@ -332,12 +333,12 @@ def tutorial_workspace(case: Case) -> Shot:
 
 def tutorial_residuals(case: Case) -> Shot:
     """Residuals of the edges."""
-    return Shot(guide.report_part(case.work, "residuals"), 1000, 800)
+    return Shot(guide.report_part(case.work, "residuals"), 1000, 750)
 
 
 def tutorial_validation(case: Case) -> Shot:
     """The page of what was held out."""
-    return Shot(guide.confirmed(case.work), 1000, 710)
+    return Shot(guide.confirmed(case.work), 1000, 665)
 
 
 def trouble_scale(case: Case) -> Shot:
@@ -350,14 +351,14 @@ def trouble_columns(case: Case) -> Shot:
     """The nominal model over an image whose readings are in exchanged columns."""
     spoil = guide.two_columns_exchanged
     folder = guide.wrong(case.work, "legs", "two columns exchanged", spoil)
-    return Shot(guide.laid_over(folder), 1000, 410)
+    return Shot(guide.laid_over(folder), 1000, 420)
 
 
 def trouble_numbering(case: Case) -> Shot:
     """The same for legs in another numbering."""
     spoil = guide.numbered_from_another_leg
     folder = guide.wrong(case.work, "legs", "numbered from another leg", spoil)
-    return Shot(guide.laid_over(folder), 1000, 410)
+    return Shot(guide.laid_over(folder), 1000, 420)
 
 
 PICTURES: dict[str, Callable[[Case], Shot]] = {

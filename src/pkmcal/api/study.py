@@ -22,7 +22,7 @@ from pkmcal.studies.engine import run_all
 from pkmcal.studies.findings import SweepResult, findings_of
 from pkmcal.studies.store import BATCHES_FOLDER, Store
 from pkmcal.studies.study_report import outcome_of
-from pkmcal.studies.sweep import STUDIED_PAPER, Value, cells_of, in_words, parsed, subject_of
+from pkmcal.studies.sweep import STUDIED_PAPER, Value, cells_of, parsed, subject_of
 from pkmcal.studies.tasks import Runner
 
 RUN_ROWS_DESCRIPTION = "one row a run"
@@ -110,7 +110,7 @@ def study(
     cells = cells_of(studied, varied)
     settings = [cell.setting for cell in cells]
     title = " ".join([studied.name if isinstance(subject, Machine) else str(subject), *vary])
-    names = [in_words(cell.values) for cell in cells]
+    names = [studied.in_words(cell.values) for cell in cells]
     opened = nullcontext() if out is None else Store.opened(Path(out), title, settings, seed)
     with opened as store, whole(progress, "Simulating") as report:
         results = run_all(settings, runs, seed, report, runner, store, names)

@@ -80,6 +80,11 @@ class MachineDifference:
     __repr__ = short_repr
 
     @property
+    def of_calibrations(self) -> bool:
+        """Whether both are calibrations; of a nominal model, a change is what was asked for."""
+        return self.a.saved is not None and self.b.saved is not None
+
+    @property
     def ordered(self) -> list[int]:
         """Indices of the parameters that differ, the most significant first."""
         size = np.abs(self.change.change)
@@ -331,7 +336,7 @@ def _with_verdict(d: MachineDifference) -> MachineDifference:
             f"No change beyond what chance explains (χ² {number(d.change.chi2, 0)} for"
             f" {d.change.dof} degrees of freedom){_tool_clause(d)}."
         )
-    elif d.a.saved and d.b.saved:
+    elif d.of_calibrations:
         headline = f"The calibrations differ by more than chance explains{_tool_clause(d)}."
     elif d.change.dof:
         headline = (
@@ -339,23 +344,23 @@ def _with_verdict(d: MachineDifference) -> MachineDifference:
         )
     else:
         headline = f"The nominal models differ{_tool_clause(d)}."
-    named = (
-        [_parameter_finding(d, k) for k in d.significant[:MOST_CHANGES_NAMED]] if d.changed else []
-    )
+    # between calibrations a change is a fault: one of them does not hold any more
+    fault = d.changed and d.of_calibrations
+    named = [_parameter_finding(d, k) for k in d.significant[:MOST_CHANGES_NAMED]] if fault else []
     n_more = len(d.significant) - len(named)
     if named and n_more > 0:
         named.append(wrong("difference.more", number=n_more))
-    if d.changed and not named:
+    if fault and not named:
         named.append(wrong("difference.together", chi2=d.change.chi2, dof=d.change.dof))
     advice: list[Finding] = []
-    if d.changed and d.a.saved and d.b.saved:
+    if d.a.saved and d.b.saved and fault:
         if d.shared == int(d.a.saved.used.sum()):
             seeds = d.a.saved.seed, d.b.saved.seed
             advice = [note("difference.same_images", seed_a=seeds[0], seed_b=seeds[1])]
         else:
             advice = [note("difference.unmodelled")]
     findings = (*refused, *named, *_temperature_findings(d), *advice)
-    return replace(d, verdict=Verdict(not d.changed and not refused, headline, findings))
+    return replace(d, verdict=Verdict(not fault and not refused, headline, findings))
 
 
 def _temperature_findings(d: MachineDifference) -> Iterator[Finding]:
@@ -381,7 +386,7 @@ def _temperature_findings(d: MachineDifference) -> Iterator[Finding]:
             temperature_a=a.temperature,
             temperature_b=b.temperature,
             tool_shift=shift,
-            sigma=sigma,
+            sigma=sigma if sigma > ROUNDING else None,
         )
 
 

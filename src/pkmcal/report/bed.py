@@ -37,7 +37,6 @@ def surface_plot(session: Session, surface: BedSurface) -> Plot:
     x, y, height, sigma = (
         (1e3 * values).tolist() for values in (surface.x, surface.y, surface.height, surface.sigma)
     )
-    most = float(np.max(np.abs(height), initial=1e-6))
     points: list[Point] = []
     for k, *values in zip(surface.configuration.tolist(), x, y, height, sigma, strict=True):
         name, (at_x, at_y, z, spread) = session.configurations[k], values
@@ -51,18 +50,37 @@ def surface_plot(session: Session, surface: BedSurface) -> Plot:
                 key=configuration_key(name),
             )
         )
-    return Plot(
-        name="surface",
-        title="How uneven the bed is",
-        caption="Heights of the points that were probed above their mean, as smooth as the data"
+    most = float(np.max(np.abs(height), initial=1e-6))
+    return bed_map(
+        "surface",
+        "How uneven the bed is",
+        points,
+        ("height, mm", most),
+        "Heights of the points that were probed above their mean, as smooth as the data"
         " show them to be. A bending of the machine is not distinguished from the bed's; that is in"
         " the standard deviations.",
-        alt=f"A map of the bed, coloured by height, which is within {number(most, 3)} mm.",
-        x=linear_axis("x, mm", x),
-        y=linear_axis("y, mm", y),
+    )
+
+
+def bed_map(
+    name: str, title: str, points: list[Point], scale: tuple[str, float], caption: str = ""
+) -> Plot:
+    """Map of the bed: a mark at each probed point, coloured by its value.
+
+    points : x, y and value, mm. scale : name of the value, and its largest magnitude.
+    """
+    label, most = scale
+    return Plot(
+        name=name,
+        title=title,
+        caption=caption,
+        alt=f"{title}: a map of the bed, coloured by {label}, which is within"
+        f" {number(most, 3)} mm.",
+        x=linear_axis("x, mm", [float(point.x) for point in points]),
+        y=linear_axis("y, mm", [float(point.y) for point in points]),
         marks=(DotsMark(name="", colour="quiet", points=tuple(points), radius=PROBE_RADIUS),),
         colours=ColourScale(
-            label="height, mm",
+            label=label,
             limits=(-most, most),
             ticks=linear_ticks(-most, most),
             diverging=True,

@@ -7,6 +7,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import GeometryError
+from pkmcal.identify.centres import Centres
 from pkmcal.judge.difference import MachineDifference
 from pkmcal.levels import ROUNDING
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
@@ -55,12 +56,11 @@ def outcome_of(d: MachineDifference) -> Outcome:
     refused = any(side.saved and not side.saved.verdict.usable for side in (d.a, d.b))
     return Outcome(
         command="diff",
-        title=f"Difference of two {d.a.machine.name}",
+        title=f"Difference of two models of {d.a.machine.name}",
         kicker=f"{d.a.name} → {d.b.name}",
         subject=f"A: {d.a.name}, a {d.a.kind}; B: {d.b.name}, a {d.b.kind}",
         verdict=d.verdict,
-        # from a nominal model a change is the purpose
-        neutral=d.changed and not refused and not (d.a.saved and d.b.saved),
+        neutral=d.changed and not refused and not d.of_calibrations,
         stamp="Changed" if d.changed else "Undecided" if refused else "No change",
         level=Level.WRONG if d.changed else Level.DOUBTFUL,
         figures=_cards(d),
@@ -85,7 +85,7 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
                     f"median over {d.tool.region}; at worst {worst} mm{spread}",
                 )
             )
-    shifted = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in d.centres]) * 1e3
+    shifted = np.concatenate([_moved(side) for side in d.centres])
     out.append(
         Figure(
             "How far did the joints move?",
@@ -103,6 +103,12 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
             )
         )
     return tuple(out)
+
+
+def _moved(side: Centres) -> Array:
+    """Distances (L,) that a body's joints moved, mm; zero within rounding."""
+    distance = np.linalg.norm(side.change, axis=-1)
+    return 1e3 * np.where(distance > ROUNDING, distance, 0.0)
 
 
 def _changes(tool_map: ToolMap) -> tuple[Array, Array]:
@@ -127,7 +133,7 @@ def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
         if finite.any():
             by_chance = middle_and_worst(sigma[finite])[0] if d.change.dof else NO_VALUE_SIGN
             rows.append(Row(name, (*middle_and_worst(off), by_chance)))
-    columns = ("At the same readings", "median", "worst", "by chance, 1σ")
+    columns = ("At the same readings", "Median", "Worst", "By chance, 1σ")
     note = (
         f"At {count(d.tool.spread, 'pose')} spread evenly over {d.tool.region}: the platform's pose"
         " by B less that by A at the same readings, frames laid over each other."
@@ -138,7 +144,7 @@ def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
 def _legs(d: MachineDifference) -> Table:
     """Table of the distances that each leg's joints moved."""
     rows: list[Row] = []
-    sides = [(np.linalg.norm(x.change, axis=-1) * 1e3, x.sigma * 1e3) for x in d.centres]
+    sides = [(_moved(x), x.sigma * 1e3) for x in d.centres]
     by_chance = bool(d.change.dof)
     for leg in range(d.a.machine.n_legs):
         cells = tuple(
@@ -149,7 +155,7 @@ def _legs(d: MachineDifference) -> Table:
     brackets = "; in brackets the standard deviation of a coordinate by chance" if by_chance else ""
     return Table(
         "Joint centres",
-        ("Leg", "base joint, mm", "platform joint, mm"),
+        ("Leg", "Base joint, mm", "Platform joint, mm"),
         tuple(rows),
         f"Distances after both machines' joints were laid over each other{brackets}.",
         brief=False,
@@ -158,7 +164,7 @@ def _legs(d: MachineDifference) -> Table:
 
 def _parameters(d: MachineDifference) -> tuple[Table, ...]:
     """Significant changes, short enough for a terminal, and a folded table of all parameters."""
-    columns = ("Parameter", "A", "B", "change", "1σ", "chance")
+    columns = ("Parameter", "A", "B", "Change", "1σ", "Chance")
     out: list[Table] = []
     if d.significant:
         rows = tuple(_row(d, k) for k in d.significant)
@@ -196,7 +202,7 @@ def _row(d: MachineDifference, k: int) -> Row:
             brief(sigma) if sigma > 0 else NO_VALUE_SIGN,
             chance,
         ),
-        mark=Level.DOUBTFUL if k in d.significant else None,
+        mark=Level.DOUBTFUL if d.of_calibrations and k in d.significant else None,
     )
 
 
@@ -210,7 +216,7 @@ def _joints(d: MachineDifference) -> Plot:
     most = 0.0
     colours: tuple[Colour, Colour] = ("nominal", "calibrated")
     for side, colour in zip(d.centres, colours, strict=True):
-        shifted = np.linalg.norm(side.change, axis=-1) * 1e3
+        shifted = _moved(side)
         sigma = side.sigma * 1e3 if d.change.dof else np.zeros_like(shifted)
         most = max(most, float((shifted + sigma).max()))
         points = tuple(
@@ -250,7 +256,8 @@ def _space(d: MachineDifference) -> tuple[Space, ...]:
         poses = tool_map.evenly[1].T_base_platform[:1]
         posture = Postures(machine.inverse(poses), poses)
     arrows = () if isinstance(tool_map, str) else (_tool_arrows(d, tool_map),)
-    change, spread = start_enlargements(extent_of(machine, posture), d.centres)
+    moved = np.empty(0) if isinstance(tool_map, str) else _changes(tool_map)[0] * 1e-3
+    change, spread = start_enlargements(extent_of(machine, posture), d.centres, moved)
     return (
         Space(
             title="Both machines, and where the tool goes",

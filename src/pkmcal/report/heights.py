@@ -7,7 +7,9 @@ import numpy as np
 from pkmcal.calibration.heights import ProbedHeights
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.outcome.blocks.base import configuration_key
+from pkmcal.outcome.blocks.plot import Plot, Point, panels, rounded
 from pkmcal.outcome.finding import Level
+from pkmcal.report.bed import bed_map
 from pkmcal.session.load import Session
 from pkmcal.session.poses import PoseTable
 from pkmcal.wording import amount, count, listed, number
@@ -36,6 +38,7 @@ def section(session: Session, heights: ProbedHeights) -> Part | None:
         "Heights",
         (noise,),
         terminal_text=(f"{summary} Worst: {worst}.",),
+        blocks=panels(*_maps(session, heights)),
         tables=(_table(session, heights),),
     )
 
@@ -66,6 +69,28 @@ def _in_mm(heights: ProbedHeights, k: int) -> list[float]:
     """x, y, error before and after, and its standard deviation, mm."""
     every = (heights.x, heights.y, heights.before, heights.after, heights.sigma)
     return [1e3 * float(values[k]) for values in every]
+
+
+def _maps(session: Session, heights: ProbedHeights) -> list[Plot]:
+    """Maps of the errors over the bed, before and after, on one scale of colours."""
+    errors = {"Before": heights.before, "After": heights.after}
+    most = 1e3 * max(float(np.nanmax(np.abs(values))) for values in errors.values())
+    out: list[Plot] = []
+    for title, values in errors.items():
+        points: list[Point] = []
+        for k in np.flatnonzero(np.isfinite(values)).tolist():
+            name, value = session.configurations[heights.configuration[k]], 1e3 * float(values[k])
+            points.append(
+                Point(
+                    x=rounded(1e3 * float(heights.x[k])),
+                    y=rounded(1e3 * float(heights.y[k])),
+                    value=rounded(value),
+                    tip=f"{name}: {number(value, 3, signed=True)} mm",
+                    key=configuration_key(name),
+                )
+            )
+        out.append(bed_map(f"heights-{title.lower()}", title, points, ("error, mm", most)))
+    return out
 
 
 def _table(session: Session, heights: ProbedHeights) -> Table:

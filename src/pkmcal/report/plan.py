@@ -46,12 +46,10 @@ PLAN_METHOD_TEXT = (
 def outcome_of(plan: MeasurementPlan) -> Outcome:
     """Outcome of ``pkmcal plan``."""
     texts: dict[str, str | bytes] = {PLAN_TABLE_FILE: _table_text(plan)}
-    parts = [_curve(plan)]
+    parts = [_curve(plan), stage_part(plan, _cameras(plan)), _order(plan)]
     if plan.tried:
         texts[PLAN_STATIONS_FILE] = yaml_text(stations_document(plan))
-        parts.append(_camera_poses(plan))
-    parts.append(stage_part(plan, _cameras(plan)))
-    parts.append(_order(plan))
+        parts.insert(2, _camera_poses(plan))
     parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *plan.subject.words)))
     machine = plan.subject.rig.machine
     gain = plan.by_chance.position / plan.promised.position
@@ -177,7 +175,7 @@ def _order(plan: MeasurementPlan) -> Part:
     ]
     table = Table(
         "In this order",
-        ("Configuration", "from", "rank", *columns),
+        ("Configuration", "From", "Rank", *columns),
         tuple(rows),
         (HANDHELD_PLACES_TEXT if by_hand else "")
         + "The way from home is the shortest that was found. Rank: if fewer are"
@@ -216,7 +214,7 @@ def _curve(plan: MeasurementPlan) -> Part:
     ]
     table = Table(
         "Accuracy by the number" + ("" if plan.subject.handheld else " from each place"),
-        ("Configurations", "position", *(["orientation"] if turns else [])),
+        ("Configurations", "Position", *(["Orientation"] if turns else [])),
         tuple(rows),
         "Standard deviations of the tool, mean over the workspace. Fewer: those of the lowest"
         " ranks. More: these again, as often.",
@@ -251,7 +249,7 @@ def _camera_poses(plan: MeasurementPlan) -> Part:
     ]
     table = Table(
         "Places of the camera",
-        ("position, m", "looks at, m", "tool from there alone"),
+        ("Position, m", "Looks at, m", "Tool from there alone"),
         tuple(rows),
         "Base frame. Chosen as a set: two places that see the same badly do not help each other."
         f" {PLAN_STATIONS_FILE} holds them as session.yaml wants them;"

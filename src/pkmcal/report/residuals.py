@@ -21,6 +21,7 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import Key, configuration_key, leg_key, station_key
 from pkmcal.outcome.blocks.plot import (
+    BandMark,
     BarsMark,
     Box,
     Colour,
@@ -191,11 +192,24 @@ def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> Plo
 
 
 def level_plot(name: str, title: str, bars: Sequence[Point]) -> Plot | None:
-    """Plot of :func:`level_bar` of configurations."""
+    """Plot of :func:`level_bar` of configurations; None without any.
+
+    An interval that all of them have is a band behind them.
+    """
     alt = f"{title}: bars of the residuals' root mean squares"
     label = f"root mean square, {SIGMAS_IN_WORDS}"
-    caption = "Lines: expected of noise alone, 95 %."
-    return bar_plot(name, title, "configurations", label, bars, alt, caption=caption)
+    intervals = {
+        (bar.low, bar.high) for bar in bars if bar.low is not None and bar.high is not None
+    }
+    if len(intervals) != 1:
+        caption = "Lines: expected of noise alone, 95 %."
+        return bar_plot(name, title, "configurations", label, bars, alt, caption=caption)
+    low, high = intervals.pop()
+    plain = [bar.model_copy(update={"low": None, "high": None}) for bar in bars]
+    caption = "Shaded: expected of noise alone, 95 %."
+    plot = bar_plot(name, title, "configurations", label, plain, alt, high=high, caption=caption)
+    band = BandMark(name="", axis="y", low=low, high=high)
+    return plot and plot.model_copy(update={"marks": (band, *plot.marks)})
 
 
 def level_bar(name: str, level: float, n: float, of: str = "") -> Point:

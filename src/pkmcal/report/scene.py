@@ -6,6 +6,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.toolmap import ToolMap
+from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
@@ -65,18 +66,11 @@ def section(
         machine=machine_shape(
             machine,
             leg_rows(machine, sigma),
-            {
-                station.name: (station.camera, inverse(T))
-                for station, T in zip(
-                    session.stations,
-                    state.T_camera_base[: len(session.stations)],
-                    strict=True,
-                )
-            },
+            station_cameras(session, estimate),
             first,
         ),
         poses=space_poses(machine, postures, [names[k] for k in some], configuration_key),
-        names=("nominal model", "calibrated"),
+        names=("Nominal model", "Calibrated"),
         changes=changes(session.machine, machine, postures, centres),
         ellipsoids=ellipsoids(centres),
         sigmas=ELLIPSOID_SIGMAS,
@@ -92,6 +86,15 @@ def section(
         + " the space bar changes between nominal model and result."
     )
     return Part("geometry", "The machine in space", blocks=(block, hint), menu="Geometry")
+
+
+def station_cameras(session: Session, estimate: Estimate) -> dict[str, tuple[Camera, Array]]:
+    """Camera and T_base_camera (4, 4) of each station, by its name."""
+    T_camera_base = estimate.state.T_camera_base[: len(session.stations)]
+    return {
+        station.name: (station.camera, inverse(T))
+        for station, T in zip(session.stations, T_camera_base, strict=True)
+    }
 
 
 def tool_arrows(tool_map: ToolMap) -> SpaceArrows:

@@ -178,7 +178,7 @@ def outcome_table(study: Study) -> Table:
             "Geometry",
             "Reached",
             "Off its way, mm",
-            "at most",
+            "At most, mm",
             "Passed goal, %",
             "Error rose, %",
             "Settled, s",

@@ -88,15 +88,21 @@ def ellipsoids(centres: tuple[Centres, ...]) -> tuple[Ellipsoid, ...]:
     return tuple(out)
 
 
-def start_enlargements(extent: float, centres: tuple[Centres, ...]) -> tuple[float, float]:
+def start_enlargements(
+    extent: float, centres: tuple[Centres, ...], arrows: Array | None = None
+) -> tuple[float, float]:
     """Round enlargements at which change and ellipsoids of the joint centres are visible.
 
     extent : of the machine, m.
+    arrows : (n,) lengths, m, that are enlarged as the change is, and stay as small; None for none.
     """
-    change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
+    change = [np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])]
+    if arrows is not None and arrows.size:
+        change.append(arrows)
     spread = ELLIPSOID_SIGMAS * np.concatenate([c.sigma for c in centres])
+    wanted = CHANGE_SHARE * extent / 2
     return (
-        min(enlargement(change, CHANGE_SHARE * extent / 2), MOST_ENLARGED_CHANGE),
+        min(*(enlargement(lengths, wanted) for lengths in change), MOST_ENLARGED_CHANGE),
         min(enlargement(spread, ELLIPSOID_SHARE * extent / 2), MOST_ENLARGED_ELLIPSOID),
     )
 

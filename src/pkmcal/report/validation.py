@@ -9,7 +9,7 @@ from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.sentences import against, better, factor
 from pkmcal.judge.validate import Validation
-from pkmcal.outcome import Figure, Outcome, Part, Row, Table
+from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
 from pkmcal.outcome.blocks.base import configuration_key, leg_key
 from pkmcal.outcome.blocks.images import Images
 from pkmcal.outcome.blocks.plot import (
@@ -21,12 +21,17 @@ from pkmcal.outcome.blocks.plot import (
     panels,
     rounded,
 )
+from pkmcal.outcome.blocks.space import Space
 from pkmcal.outcome.blocks.text import Hint, Paragraph
 from pkmcal.report.charts import NORMAL_90, bar_plot, box, row_plot
 from pkmcal.report.pictures import images_of_configurations
+from pkmcal.report.scene import station_cameras
+from pkmcal.report.space import space_points, space_poses
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, decimals, number
+from pkmcal.web.motion import Postures
+from pkmcal.web.stage import leg_rows, machine_shape
+from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, decimals, listed, number
 
 RESIDUAL_COLUMNS = {
     "Joint": "",
@@ -40,6 +45,8 @@ RESIDUAL_COLUMNS = {
     "Common σ": "Standard deviation of that.",
 }
 """Columns of the table of readings, with their explanations."""
+SMALLEST_POINT = 0.3
+"""Size of the smallest point of a configuration, relative to that with the largest residuals."""
 FIRST_IMAGES = 6
 """Images on the page before all are asked for."""
 VALIDATION_METHOD_TEXT = (
@@ -68,6 +75,7 @@ def outcome_of(v: Validation) -> Outcome:
     notes = tuple(f"{what}: {', '.join(names)}." for what, names in sentences if names)
     parts = (
         _readings(v.judged, v.session) if v.judged else None,
+        _configurations(v.judged, v) if v.judged else None,
         _images(v.judged, v) if v.judged else None,
         Part("paths", "Paths", tables=(paths_table(v.paths),)) if v.paths else None,
         Part("regions", "Regions", tables=(regions_table(v.regions, v.session),))
@@ -119,6 +127,8 @@ def _cards(judged: NominalComparison, v: Validation) -> tuple[Figure, ...]:
             "Is the promise kept?",
             ((number(test.factor, 2), "× the deviations"),),
             f"1 is expected; χ² {number(test.chi2, 0)} for {count(test.dof, 'degree')} of freedom",
+            limit="within chance" if test.holds else "more than chance explains",
+            mark="good" if test.holds else Level.DOUBTFUL,
         ),
         Figure(
             "What is it based on?",
@@ -190,10 +200,71 @@ def _images(judged: NominalComparison, v: Validation) -> Part | None:
         f"Of the {count(n, 'judged configuration')}, the one with the largest residuals first."
         " Lines: measured edges in their leg's colour, dashed where they were rejected."
     )
-    hint = "A click on a bar of the chart above leads to its image."
+    hint = "A click on a bar, a row or a point above leads to its image."
     legs = v.session.machine.n_legs if any(one.overlays for one in images) else 0
     block = Images(images=images, first=FIRST_IMAGES, legs=legs)
     return Part("photographs", "Images", blocks=(Paragraph(text=text), Hint(text=hint), block))
+
+
+def _configurations(judged: NominalComparison, v: Validation) -> Part | None:
+    """Section with the machine at the judged configurations, the one with the largest residuals
+    first, and their table; None for readings of two units.
+    """
+    unit, session, estimate = _unit(v.session), v.session, v.remeasured.estimate
+    order = [
+        k for k in np.argsort(-judged.after, kind="stable").tolist() if np.isfinite(judged.after[k])
+    ]
+    if unit is None or not order:
+        return None
+    scale, unit_name = DISPLAY_UNITS[unit]
+    rows = judged.rows[order]
+    names = [session.configurations[row] for row in rows]
+    keys = [configuration_key(name) for name in names]
+    after, before = ((scale * values[order]).tolist() for values in (judged.after, judged.before))
+    stations: dict[int, list[str]] = {}
+    for station in session.stations:
+        for image in station.images:
+            stations.setdefault(image.configuration, []).append(station.name)
+    table = Table(
+        "Residuals by configuration",
+        ("Configuration", "Seen from", f"Calibrated, {unit_name}", f"Nominal model, {unit_name}"),
+        tuple(
+            Row(name, (listed(stations.get(row, []), 3), brief(new), brief(old)), key=key)
+            for name, row, new, old, key in zip(
+                names, rows.tolist(), after, before, keys, strict=True
+            )
+        ),
+        "Root mean squares of the readings' residuals. A row leads to its images, and takes the"
+        " machine above there.",
+        brief=False,
+        words=(1,),
+    )
+    machine = estimate.machine
+    postures = Postures(session.joints[rows], estimate.state.T_base_platform[rows])
+    tips = [
+        f"{name}: readings {brief(new)} {unit_name} off"
+        for name, new in zip(names, after, strict=True)
+    ]
+    sizes = np.maximum(np.array(after) / after[0], SMALLEST_POINT).round(2).tolist()
+    block = Space(
+        title="Where the residuals are large",
+        caption="The machine at the judged configurations, the one with the largest residuals"
+        " first. Points are the platform's positions: the larger, the larger the residuals.",
+        alt="The machine in three dimensions at the judged configurations, with a point for each;"
+        " the table below has the numbers.",
+        machine=machine_shape(
+            machine,
+            leg_rows(machine, None),
+            station_cameras(session, estimate),
+            Postures(*(part[:1] for part in postures)),
+        ),
+        poses=space_poses(machine, postures, names, configuration_key),
+        points=(
+            space_points("Judged poses", "--calibrated", postures.T_base_platform[:, :3, 3], keys,
+                         tips, sizes),
+        ),
+    )  # fmt: skip
+    return Part("configurations", "Configurations", blocks=(block,), tables=(table,))
 
 
 def _worst(judged: NominalComparison, session: Session) -> tuple[str, ...]:

@@ -518,7 +518,12 @@ def _by_configuration(w: Watch) -> Plot | None:
         y=linear_axis("root mean square, standard deviations", (*values, NOISE_EXCESS), zero=True),
         marks=(
             RuleMark(name="expected of noise alone", axis="y", at=1.0),
-            RuleMark(name="emphasized from here", axis="y", at=NOISE_EXCESS, colour="calibrated"),
+            RuleMark(
+                name=f"{NOISE_EXCESS:g} times as much",
+                axis="y",
+                at=NOISE_EXCESS,
+                colour="calibrated",
+            ),
             LineMark(name="", colour="quiet", points=line_points(names, values)),
             DotsMark(name="residuals", colour="calibrated", points=tuple(points)),
         ),

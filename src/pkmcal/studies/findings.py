@@ -22,7 +22,6 @@ from pkmcal.studies.sweep import (
     StudySubject,
     SweptSetting,
     Value,
-    in_words,
 )
 from pkmcal.wording import brief, count, decimals, number
 
@@ -155,7 +154,7 @@ class SweepResult:
         for cell in self.found:
             error = with_error(cell.with_usable_error(cell.position).times(1e3))
             lines.append(
-                f"  {in_words(cell.values) or 'as it is'}: tool {error} mm,"
+                f"  {self.subject.in_words(cell.values) or 'as it is'}: tool {error} mm,"
                 f" stated {brief(1e3 * cell.position_sigma)} mm,"
                 f" {number(100 * cell.covered.value, 1)} % of the 95 % intervals hold,"
                 f" {number(100 * cell.failed.value, 1)} % failed"

@@ -45,7 +45,7 @@ from pkmcal.studies.findings import (
     with_error,
 )
 from pkmcal.studies.statistics import Summary
-from pkmcal.studies.sweep import SweptSetting, Value, in_words
+from pkmcal.studies.sweep import SweptSetting
 from pkmcal.wording import amount, brief, count, number
 
 MOST_LINES = 8
@@ -93,7 +93,10 @@ def outcome_of(study: SweepResult) -> Outcome:
         verdict=Verdict(
             usable=not bad and not failing,
             headline=_headline(study, gains, bad),
-            findings=(*map(_coverage_finding, bad), *map(_failure_finding, failing)),
+            findings=(
+                *(_coverage_finding(study, cell) for cell in bad),
+                *(_failure_finding(study, cell) for cell in failing),
+            ),
         ),
         stamp="Deviations hold" if not bad and not failing else "Look closer",
         figures=_key_figures(study),
@@ -146,15 +149,15 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
     gain = sure[0]
     return (
         f"{accuracy}; most is gained by {_name(gain.name)}: from"
-        f" {value_with_unit(study, gain.name, gain.worst)} to"
-        f" {value_with_unit(study, gain.name, gain.best)} it falls from"
+        f" {study.subject.value_text(gain.name, gain.worst)} to"
+        f" {study.subject.value_text(gain.name, gain.best)} it falls from"
         f" {amount(gain.before, 'm')} to {amount(gain.after, 'm')}"
         f" ({brief(gain.times)} times). {text}"
     )
 
 
-def _coverage_finding(cell: CellFindings) -> Finding:
-    where = in_words(cell.values) if cell.values else ""
+def _coverage_finding(study: SweepResult, cell: CellFindings) -> Finding:
+    where = study.subject.in_words(cell.values)
     return wrong(
         "study.coverage",
         where,
@@ -165,20 +168,13 @@ def _coverage_finding(cell: CellFindings) -> Finding:
     )
 
 
-def _failure_finding(cell: CellFindings) -> Finding:
-    where = in_words(cell.values) if cell.values else ""
+def _failure_finding(study: SweepResult, cell: CellFindings) -> Finding:
+    where = study.subject.in_words(cell.values)
     return wrong("study.fails", where, of=where or None, percent=100 * cell.failed.value)
 
 
 def _name(name: str) -> str:
     return name.replace("_", " ")
-
-
-def value_with_unit(study: SweepResult, name: str, value: Value) -> str:
-    """A value with its unit."""
-    unit = study.subject.names[name].unit
-    text = value if isinstance(value, str) else f"{value:g}"
-    return f"{text}{unit}" if unit == "°" else f"{text} {unit}".rstrip()
 
 
 # ------------------------------------------------------------------ cards and tables
@@ -192,7 +188,11 @@ def _rotates(study: SweepResult) -> bool:
 def _key_figures(study: SweepResult) -> tuple[Figure, ...]:
     """Key figures of the best combination."""
     best = min(study.found, key=lambda cell: np.nan_to_num(cell.position.value, nan=np.inf))
-    which = f"with {in_words(best.values)}" if len(study.found) > 1 else "root mean square"
+    which = (
+        f"with {study.subject.in_words(best.values)}"
+        if len(study.found) > 1
+        else "root mean square"
+    )
     error = best.with_usable_error(best.position).error
     errors = (
         (brief(1e3 * best.position.value), "mm"),
@@ -218,11 +218,16 @@ def _key_figures(study: SweepResult) -> tuple[Figure, ...]:
             "Do its 95 % intervals hold?",
             ((number(100 * best.covered.value, 1), "%"),),
             f"of all parameters; {number(100 * best.covered_tool.value, 1)} % of the tool's poses",
+            limit=f"{100 * (PROMISED_COVERAGE - COVERAGE_TOLERANCE):.0f} % is the least, apart from"
+            " chance",
+            mark=None if best.honest is None else "good" if best.honest else Level.WRONG,
         ),
         Figure(
             "Does it always converge?",
             ((number(100 * best.failed.value, 1), "% fail"),),
             f"of {best.runs} runs",
+            limit=f"limit {100 * (1 - NEARLY_ALL):.0f} %",
+            mark="good" if best.failed.value <= 1 - NEARLY_ALL else Level.WRONG,
         ),
     )
 
@@ -246,7 +251,9 @@ def _table(study: SweepResult) -> Table:
             number(100 * cell.failed.value, 1),
         )
         mark = Level.DOUBTFUL if cell.honest is False else None
-        rows.append(Row(in_words(cell.values) or study.subject.name, cells, mark=mark))
+        rows.append(
+            Row(study.subject.in_words(cell.values) or study.subject.name, cells, mark=mark)
+        )
     error = (
         "Root mean square error of the tool after a calibration, with its standard error if it has"
         f" {LEAST_FREEDOM} degrees of freedom or more: those of the batches of runs."
@@ -254,7 +261,7 @@ def _table(study: SweepResult) -> Table:
     stated = "Standard deviation that the calibrations state."
     largest = "Error that is not exceeded in 95 % of all runs and poses."
     heads = {
-        "Varied": "",
+        "Setting": "",
         "Tool, mm": error,
         "Stated, mm": stated,
         "Held, %": "Share of the 95 % intervals of all parameters that hold the truth.",
@@ -282,7 +289,7 @@ def _coverage_part(study: SweepResult) -> Part:
     ]
     table = Table(
         "95 % intervals of the parameters that hold, %",
-        ("", "mean", "least", "most"),
+        ("Parameter", "Mean", "Least", "Most"),
         tuple(rows),
         brief=False,
         note="Least and most: of single parameters and combinations; chance alone spreads them.",
@@ -301,12 +308,14 @@ def _coverage_part(study: SweepResult) -> Part:
 
 
 def _kind(name: str) -> str:
-    """Kind of a parameter: its name without leg and coordinate."""
+    """Kind of a parameter in words: its name without leg and coordinate."""
     if "]" not in name:  # [A]'s: A2 x, q5
         return {"A": "base centres", "B": "platform centres"}.get(name[:1], "offsets")
     rest = name.partition("].")[2]
     rest = rest.removesuffix(".x").removesuffix(".y").removesuffix(".z")
-    return "tubes.radius" if rest.startswith("tubes") else rest
+    if rest.startswith("tubes"):
+        return "tube radius"
+    return rest.replace("center", "centre").replace(".", " ")
 
 
 # ------------------------------------------------------------------ plots
@@ -319,7 +328,8 @@ def _groups(study: SweepResult, name: str) -> Iterator[tuple[str, list[CellFindi
         rest = {key: value for key, value in cell.values.items() if key != name}
         others.setdefault(tuple(rest.items()), []).append(cell)
     for rest, cells in others.items():
-        yield in_words({k: v for k, v in rest if len(study.varied[k]) > 1}), cells
+        several = {k: v for k, v in rest if len(study.varied[k]) > 1}
+        yield study.subject.in_words(several), cells
 
 
 def _curves(study: SweepResult) -> list[Plot]:
@@ -342,17 +352,18 @@ def _curve(study: SweepResult, name: str, groups: list[tuple[str, list[CellFindi
     """Plot of the tool's error along one name: one series for each combination of the others, or,
     where there are too many, one of the means.
     """
-    values, unit = study.varied[name], study.subject.names[name].unit
-    x = _value_axis(_name(name) + (f", {unit}" if unit else ""), values)
+    values, (factor, unit) = study.varied[name], study.subject.display_unit(name)
+    display_values = [value if isinstance(value, str) else factor * value for value in values]
+    x = _value_axis(_name(name) + (f", {unit}" if unit else ""), display_values)
     marks: list[Mark] = []
     if len(groups) > MOST_LINES:
         means = [study.at(name, value) for value in values]
-        marks += _series(study, name, x, "all else together", "calibrated", means)
+        marks += _series(study, name, x, display_values, "all else together", "calibrated", means)
     else:
         for k, (of, cells) in enumerate(groups):
             colour, stated = leg_colour(k + 1), [cell.position_sigma for cell in cells]
             errors = [cell.with_usable_error(cell.position) for cell in cells]
-            marks += _series(study, name, x, of, colour, errors, stated)
+            marks += _series(study, name, x, display_values, of, colour, errors, stated)
     points = [p for mark in marks if isinstance(mark, DotsMark) for p in mark.points]
     ends = [v for p in points for v in (p.y, p.high) if isinstance(v, float)]
     return Plot(
@@ -372,6 +383,7 @@ def _series(
     study: SweepResult,
     name: str,
     x: PlotAxis,
+    display_values: Sequence[float | str],
     of: str,
     colour: Colour,
     errors: list[Summary],
@@ -379,12 +391,13 @@ def _series(
 ) -> Iterator[Mark]:
     """Dots of the errors at each value of a name, and crosses of the stated standard deviations.
 
+    display_values : the values in the unit of the axis.
     of : combination of the other values, in words; empty without any.
     """
     dots, crosses = list[Point](), list[Point]()
     for k, (value, error) in enumerate(zip(study.varied[name], errors, strict=True)):
-        at = str(value) if isinstance(value, str) or x.scale == "categories" else float(value)
-        where = value_with_unit(study, name, value) + (f", {of}" if of else "")
+        at = _category(display_values[k]) if x.scale == "categories" else display_values[k]
+        where = study.subject.value_text(name, value) + (f", {of}" if of else "")
         if np.isfinite(error.value):
             reach = 2 * error.error if np.isfinite(error.error) else 0.0
             dots.append(
@@ -409,13 +422,17 @@ def _series(
         yield DotsMark(name=label, colour=colour, points=tuple(crosses), symbol="cross")
 
 
-def _value_axis(label: str, values: Sequence[Value]) -> PlotAxis:
+def _category(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _value_axis(label: str, values: Sequence[float | str]) -> PlotAxis:
     """Axis of a name's values: of numbers, logarithmic if they span much, with the values as ticks
     where these are three to ``MOST_TICKS``; two values, and names, are categories.
     """
-    numbers = [float(v) for v in values if not isinstance(v, str)]
+    numbers = [v for v in values if not isinstance(v, str)]
     if len(numbers) < len(values) or len(numbers) < LEAST_NUMBERS:
-        return category_axis((str(v) for v in values), label)
+        return category_axis(map(_category, values), label)
     wide = min(numbers) > 0 and max(numbers) / min(numbers) >= LOG_AXIS_RATIO
     axis = (log_axis if wide else linear_axis)(label, numbers)
     if len(numbers) <= MOST_TICKS:

@@ -33,7 +33,7 @@ from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
 from pkmcal.studies.tasks import StudySetting
 from pkmcal.studies.varied import DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED, Varied
-from pkmcal.wording import listed
+from pkmcal.wording import DISPLAY_UNITS, listed, with_unit
 
 STUDIED_PAPER = "a"
 MOST_CELLS = 500
@@ -76,6 +76,35 @@ class StudySubject:
         """Names that can be varied."""
         return DESIGN_NAMES_VARIED if isinstance(self.design, Design) else PAPER_NAMES_VARIED
 
+    def unit_of(self, name: str) -> str:
+        """Unit of a name's numbers: m or rad alone where all readings of the machine are of a
+        kind.
+        """
+        unit = self.names[name].unit
+        if unit == "m or rad" and isinstance(self.design, Design):
+            kinds = set(self.design.machine.joint_units)
+            return kinds.pop() if len(kinds) == 1 else unit
+        return unit
+
+    def display_unit(self, name: str) -> tuple[float, str]:
+        """Factor and unit in which a name's numbers are shown: mm or degrees for readings."""
+        unit = self.unit_of(name)
+        return (1.0, unit) if unit == self.names[name].unit else DISPLAY_UNITS[unit]
+
+    def value_text(self, name: str, value: Value) -> str:
+        """A value of a name with its unit."""
+        factor, unit = self.display_unit(name)
+        return value if isinstance(value, str) else with_unit(f"{value * factor:g}", unit).rstrip()
+
+    def in_words(self, values: Mapping[str, Value]) -> str:
+        """Description of a combination, such as "stations 2, edge noise 0.1 px"; empty if nothing
+        varies.
+        """
+        return ", ".join(
+            f"{name.replace('_', ' ')} {self.value_text(name, value)}"
+            for name, value in values.items()
+        )
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -83,16 +112,6 @@ class Cell:
 
     values: Mapping[str, Value]
     setting: SweptSetting
-
-
-def in_words(values: Mapping[str, Value]) -> str:
-    """Description of a combination, such as "stations 2, edge noise 0.1"; empty if nothing
-    varies.
-    """
-    return ", ".join(
-        f"{name.replace('_', ' ')} {value if isinstance(value, str) else f'{value:g}'}"
-        for name, value in values.items()
-    )
 
 
 def subject_of(origin: Machine | str) -> StudySubject:
@@ -206,11 +225,9 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
             raise InputError(
                 "a value is missing", where="--vary", found=text, expected=f"{name}=V1,V2"
             )
-        varied = subject.names[name]
-        unit = {"°": "deg"}.get(varied.unit, varied.unit)
-        if unit == "m or rad" and isinstance(subject.design, Design):
-            unit = " or ".join(dict.fromkeys(subject.design.machine.joint_units))
-        values = [_value(name, varied, unit, part) for part in parts]
+        unit = subject.unit_of(name)
+        readable = {"°": "deg"}.get(unit, unit)
+        values = [_value(name, subject.names[name], readable, part) for part in parts]
         if len(set(values)) < len(values):
             raise InputError(
                 "a value occurs twice", where="--vary", found=text, code="study.value_twice"
