@@ -24,7 +24,7 @@ from pkmcal.calibration.camera_responses import ResponseComparison, responses_by
 from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.assembly import state_of
-from pkmcal.identify.bundle import bundle
+from pkmcal.identify.bundle import bundle, fit_state
 from pkmcal.identify.confirmation import rejected_units
 from pkmcal.identify.covariance import covariance_by_noise, machine_covariance
 from pkmcal.identify.estimate import Estimate
@@ -308,7 +308,8 @@ def imputation_variance(
         try:
             edges = _edges(one, options)
             measurements = measurements_of(session, case.boards, edges, own, estimate)
-            ended = bundle(session.machine, measurements, _without_camera_changes(drawn.state))
+            there = _without_camera_changes(drawn.state)
+            ended = fit_state(session.machine, measurements, there, scale_readings=True)
         except (PkmcalError, np.linalg.LinAlgError) as error:
             failures.append(str(error))
             continue

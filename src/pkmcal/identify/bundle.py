@@ -610,14 +610,16 @@ def fit_state(
     measurements: Measurements,
     start: State,
     marginal_prior: MarginalPrior | None = None,
+    *,
+    scale_readings: bool = False,
 ) -> Fit:
-    """Robust joint estimate without covariance, for trials; the readings' noise is as stated.
+    """Robust joint estimate without covariance, for trials.
 
-    Arguments and errors are those of :func:`bundle`.
+    Arguments and errors are those of :func:`bundle`; the readings' noise is as stated by default.
     """
     gauge = default_gauge(machine)
     assembled, result = _assembled_fit(
-        machine, measurements, start, gauge, marginal_prior, scale_readings=False
+        machine, measurements, start, gauge, marginal_prior, scale_readings=scale_readings
     )
     problem = result.info.problem
     state = in_gauge(machine, state_of(assembled, result.solution.state, start), gauge)
