@@ -578,6 +578,31 @@ def bundle(
     return _estimate(machine, measurements, start, assembled, result, gauge)
 
 
+class BundleSolution(NamedTuple):
+    """Solution of :func:`bundle` with its defaults, from which its estimate follows.
+
+    The covariance of an estimate depends on the variance between imputations, the solution does
+    not.
+    """
+
+    machine: Machine
+    start: State
+    assembled: Assembled
+    result: BatchResult
+
+    @classmethod
+    def of(cls, machine: Machine, measurements: Measurements, start: State) -> BundleSolution:
+        """Solution of a session; arguments and errors are those of :func:`bundle`."""
+        gauge = default_gauge(machine)
+        solved = _assembled_fit(machine, measurements, start, gauge, None)
+        return cls(machine, start, *solved)
+
+    def estimate(self, measurements: Measurements) -> Estimate:
+        """Estimate by the same measurements, with their variance between imputations."""
+        gauge = default_gauge(self.machine)
+        return _estimate(self.machine, measurements, self.start, self.assembled, self.result, gauge)
+
+
 class Fit(NamedTuple):
     """Joint estimate without covariance.
 
