@@ -25,7 +25,7 @@ from pkmcal.calibration.refinement import (
     imputation_variance,
 )
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
-from pkmcal.identify.bundle import bundle
+from pkmcal.identify.bundle import BundleSolution, bundle
 from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
@@ -199,7 +199,14 @@ def test_looks_scatter_by_their_variance_in_that_of_noise(tripod_calibration):
     assert _variance(2 * changes, estimate) == pytest.approx(4, rel=0.1)
 
 
-def turns_of(calibration, shading, images):
+@pytest.fixture(scope="module")
+def tripod_solution(tripod_calibration):
+    """Solution of an estimate from its last measurement pass."""
+    value = tripod_calibration
+    return BundleSolution.of(value.session.machine, value.measurements, value.estimate.state)
+
+
+def turns_of(calibration, solution, shading, images):
     """Result of the last measurement pass, with its edges shaded by so many px, as light moves
     them.
     """
@@ -211,7 +218,7 @@ def turns_of(calibration, shading, images):
         replace(estimate, edge_noise=noise),
         calibration.cameras,
         images=images,
-        start=estimate.state,
+        solution=solution,
         options=FEW_IMPUTATIONS,
     )
 
@@ -222,21 +229,23 @@ def passes_from_likely_machines(calibration, value):
 
 
 @pytest.mark.parametrize(("times", "remeasured"), [(0.9, False), (1.1, True)])
-def test_painted_legs_on_a_tripod_are_not_looked_for_again(tripod_calibration, times, remeasured):
+def test_painted_legs_on_a_tripod_are_not_looked_for_again(
+    tripod_calibration, tripod_solution, times, remeasured
+):
     images = read_images(tripod_calibration.session)
-    value = turns_of(tripod_calibration, times * POLISHED_SHADING, images)
+    value = turns_of(tripod_calibration, tripod_solution, times * POLISHED_SHADING, images)
     ended = passes_from_likely_machines(tripod_calibration, value)
     assert (ended is value) != remeasured
     assert (ended.measurements.imputation_covariance > 0) == remeasured
 
 
-def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibration):
+def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibration, tripod_solution):
     """In images without content no measurement pass finds an edge."""
     empty = [
         replace(p, images=[np.full_like(image, 90) for image in p.images])
         for p in read_images(tripod_calibration.session)
     ]
-    value = turns_of(tripod_calibration, 2 * POLISHED_SHADING, empty)
+    value = turns_of(tripod_calibration, tripod_solution, 2 * POLISHED_SHADING, empty)
     ended = passes_from_likely_machines(tripod_calibration, value)
     assert ended.estimate.statistics.look_scatter == 1
 

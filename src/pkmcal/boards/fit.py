@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,11 +22,12 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import apply, perturb, pose, rotation, skew
+from pkmcal.geometry.rigid import apply, cross, perturb, pose, rotation
 from pkmcal.solver.elimination import Linear, eliminate
 from pkmcal.solver.kernels import final_weights
 from pkmcal.solver.ranks import NORMAL_RANK_TOLERANCE, normal_root
 from pkmcal.solver.search import Stop, Values, minimise
+from pkmcal.solver.strips import Compact, compact
 
 MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
 """Median length of a vector of two normal numbers, in their standard deviation."""
@@ -121,16 +123,27 @@ class CameraProblem:
         there = apply(state.T_camera_board[..., None, :, :], self.points)
         off = (camera.project(there) - self.pixels) * self.scale[..., None]
         off = np.where(self.scale[..., None] > 0, off, 0.0)
-        return Values(off.reshape(*off.shape[:2], -1), np.zeros((len(off), 0)))
+        value = off.reshape(*off.shape[:2], -1)
+        rows = partial(self._compact, state, value)
+        return Values(value, np.zeros((len(off), 0)), rows)
 
     def linearize(self, state: CameraState) -> Linear:
         """Whitened residuals and their exact derivatives."""
+        return self._linear(state, self.residuals(state).value)
+
+    def _compact(self, state: CameraState, value: Array) -> Compact:
+        """:meth:`linearize` at a state whose residuals are known, for the normal equations."""
+        return compact(self._linear(state, value))
+
+    def _linear(self, state: CameraState, value: Array) -> Linear:
+        """:meth:`linearize` at a state with residuals (B, K, 2 N)."""
         camera = with_free(self.camera, self.free, state)
-        rotated = apply(state.T_camera_board[..., None, :, :], self.points)
-        turned = rotated - state.T_camera_board[..., None, :3, 3]
-        by_point, by_parameters = camera.project_jacobians(rotated)
-        by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
-        value = self.residuals(state).value
+        there = apply(state.T_camera_board[..., None, :, :], self.points)
+        turned = there - state.T_camera_board[..., None, :3, 3]
+        by_point, by_parameters = camera.project_jacobians(there)
+        # -g^T [t]x = (t x g)^T for each row g of the derivative by the point
+        by_turn = cross(turned[..., None, :], by_point)
+        by_pose = np.concatenate([by_turn, by_point], axis=-1)
         usable = np.isfinite(value)
         shape = value.shape
         scale = self.scale[..., None, None]

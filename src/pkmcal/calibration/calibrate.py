@@ -297,9 +297,7 @@ def calibrate_measurements(
     clock = Clock(progress)
     start = start_state(session.machine, measurements, T_camera_base)
     estimate = bundle(session.machine, measurements, start)
-    turns = RefinementResult(
-        observation, measurements, estimate, refinement_of(session, False), start=start
-    )
+    turns = RefinementResult(observation, measurements, estimate, refinement_of(session, False))
     scene = PriorScene(session.machine, T_camera_base, start.T_base_platform)
     case = Case(session, [], Boards(), scene)
     return _judge(case, _Identified(turns, estimate, None, None), (), (), "bundle", 0, clock)

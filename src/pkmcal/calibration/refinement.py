@@ -24,7 +24,7 @@ from pkmcal.calibration.camera_responses import ResponseComparison, responses_by
 from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.assembly import state_of
-from pkmcal.identify.bundle import bundle
+from pkmcal.identify.bundle import BundleSolution, bundle, fit_state
 from pkmcal.identify.confirmation import rejected_units
 from pkmcal.identify.covariance import covariance_by_noise, machine_covariance
 from pkmcal.identify.estimate import Estimate
@@ -123,7 +123,7 @@ class RefinementResult(NamedTuple):
     images : as they were measured, with their binning.
     blur : blur of their edges, px, by station.
     scatter : scatter of coarse edges, see :class:`PriorScene`.
-    start : initial state of the last estimate.
+    solution : solution of the last estimate; None without images of legs.
     change : change of the machine by the last pass, in its standard deviations, as
         ``RefinementOptions.settled_change``.
     failures : reasons why imputations have no estimate.
@@ -137,7 +137,7 @@ class RefinementResult(NamedTuple):
     images: Sequence[StationImages] = ()
     blur: BlurByStation = MappingProxyType({})
     scatter: float = 1.0
-    start: State | None = None
+    solution: BundleSolution | None = None
     change: float = 0.0
     failures: tuple[str, ...] = ()
     options: RefinementOptions = REFINEMENT
@@ -174,7 +174,7 @@ def refine_alternating(
     passes: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
     responses = ResponseComparison()
-    scatter, start = case.scene.scatter, estimate.state
+    scatter, solution = case.scene.scatter, None
     change, rest = 0.0, part(progress, 0.2, 1)
     for turn in range(options.most_passes):
         now, rest = part(rest, 0, 0.5), part(rest, 0.5, 1)
@@ -196,7 +196,8 @@ def refine_alternating(
         )
         if turn == 0 and shifted > options.astray_distance:
             start = initial_guess(machine, measurements, start)
-        estimate = bundle(machine, measurements, start)
+        solution = BundleSolution.of(machine, measurements, start)
+        estimate = solution.estimate(measurements)
         scatter *= _scatter_of(measurements.edges.coarse, estimate)
         lap("identify")
         if turn == 0:
@@ -224,7 +225,7 @@ def refine_alternating(
                 blur = {}
     observation = observation_of(session, passes, boards, measurements, estimate, images)
     return RefinementResult(
-        observation, measurements, estimate, cameras, responses, images, blur, scatter, start,
+        observation, measurements, estimate, cameras, responses, images, blur, scatter, solution,
         change, options=options,
     )  # fmt: skip
 
@@ -282,7 +283,9 @@ def imputation_variance(
     """
     session, estimate, options = case.session, turns.estimate, turns.options
     by_hand = any(session.stations[p.station].handheld for p in turns.images)
-    if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
+    if turns.solution is None or not (
+        by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING
+    ):
         return turns
     # edges that drawn machines predict
     machines = list(_as_likely(session, estimate, options.imputations, rng))
@@ -308,7 +311,8 @@ def imputation_variance(
         try:
             edges = _edges(one, options)
             measurements = measurements_of(session, case.boards, edges, own, estimate)
-            ended = bundle(session.machine, measurements, _without_camera_changes(drawn.state))
+            there = _without_camera_changes(drawn.state)
+            ended = fit_state(session.machine, measurements, there, scale_readings=True)
         except (PkmcalError, np.linalg.LinAlgError) as error:
             failures.append(str(error))
             continue
@@ -319,7 +323,7 @@ def imputation_variance(
         apart = np.stack(offsets) - np.mean(offsets, axis=0)
         variance = _variance(apart, estimate) * len(offsets) / (len(offsets) - 1)
     measurements = replace(turns.measurements, imputation_covariance=variance)
-    again = bundle(session.machine, measurements, turns.start)
+    again = turns.solution.estimate(measurements)
     return turns._replace(measurements=measurements, estimate=again, failures=tuple(failures))
 
 

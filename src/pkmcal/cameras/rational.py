@@ -187,12 +187,12 @@ def _distort_by_coefficients(xy: Array, k: Array) -> Array:
 @lru_cache(maxsize=64)  # evaluated with every projection
 def _radial_fold(*k: float) -> float:
     """Squared radius where the distorted radius stops increasing, or its pole; inf without one."""
-    N = np.polynomial.Polynomial([1.0, k[0], k[1], k[4]])
-    D = np.polynomial.Polynomial([1.0, k[5], k[6], k[7]])
-    s = np.polynomial.Polynomial([0.0, 1.0])
-    # d(r N / D)/dr = (N D + 2 s (N' D - N D')) / D^2
-    slope = N * D + 2 * s * (N.deriv() * D - N * D.deriv())
-    roots = np.concatenate([p.trim().roots() for p in (slope, D)])
+    # cubics in s with the highest power first; a constant term of one, so that neither is zero
+    N, D = np.array([k[4], k[1], k[0], 1.0]), np.array([k[7], k[6], k[5], 1.0])
+    # d(r N / D)/dr = (N D + 2 s (N' D - N D')) / D^2, with the coefficients of 2 s N' in front
+    powers = np.array([6.0, 4.0, 2.0, 0.0])
+    slope = np.convolve(N, D) + np.convolve(powers * N, D) - np.convolve(N, powers * D)
+    roots = np.concatenate([np.roots(slope), np.roots(D)])
     real = roots[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)].real
     return float(real.min()) if real.size else np.inf
 

@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ LONGEST_QUOTE = 60
 """Characters of a value that a message quotes: enough to recognise it, on one line."""
 SHORTEST_PART = 4
 """Letters from which on a part of a name is recognised as the whole."""
+LONGEST_CACHED_TEXT = 2**15
+"""Characters up to which a text's node tree is cached: of the sixteen trees some 100 MB at most."""
 TEXT_BLOCK_BYTES = 2**20
 """Bytes of a text in memory at a time, where it is read line by line."""
 
@@ -233,11 +236,11 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
     """Parse YAML text as `read_yaml` does; `path` only names it."""
     label = label or path.name
     try:
-        loader = _Loader(text)
-        node = loader.get_single_node()
+        compose = _recently_composed if len(text) <= LONGEST_CACHED_TEXT else _composed
+        node = compose(text)
         if node is None:
             raise InputError("the file is empty", where=label, expected="keys and values")
-        builder = _Builder(loader, label)
+        builder = _Builder(label)
         data = builder.value(node, ())
     except _LimitError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
@@ -269,9 +272,19 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
     return _checked(Document(path, label, data, builder.lines))
 
 
+def _composed(text: str) -> yaml.Node | None:
+    """Node tree of a text, None for an empty one; raises the errors of PyYAML."""
+    return _Loader(text).get_single_node()
+
+
+_recently_composed = lru_cache(maxsize=16)(_composed)
+""":func:`_composed`, cached because a machine's file is read again by every step that needs it, and
+PyYAML takes as long as a small estimate; nodes are not changed."""
+
+
 def compose_yaml(text: str) -> yaml.Node:
     """Node tree of a text that `parse_yaml` has accepted, with the position of each node."""
-    node = _Loader(text).get_single_node()
+    node = _composed(text)
     if node is None:
         raise InputError("the file is empty", expected="keys and values")
     return node
@@ -400,8 +413,7 @@ _Pairs = dict[str, tuple[yaml.Node, yaml.Node]]
 class _Builder:
     """Converts a YAML node tree to plain data; records lines, and refuses what would be misread."""
 
-    def __init__(self, loader: _Loader, label: str) -> None:
-        self.loader = loader
+    def __init__(self, label: str) -> None:
         self.label = label
         self.lines: dict[Keys, int] = {}
         self._open: set[int] = set()

@@ -578,6 +578,31 @@ def bundle(
     return _estimate(machine, measurements, start, assembled, result, gauge)
 
 
+class BundleSolution(NamedTuple):
+    """Solution of :func:`bundle` with its defaults, from which its estimate follows.
+
+    The covariance of an estimate depends on the variance between imputations, the solution does
+    not.
+    """
+
+    machine: Machine
+    start: State
+    assembled: Assembled
+    result: BatchResult
+
+    @classmethod
+    def of(cls, machine: Machine, measurements: Measurements, start: State) -> BundleSolution:
+        """Solution of a session; arguments and errors are those of :func:`bundle`."""
+        gauge = default_gauge(machine)
+        solved = _assembled_fit(machine, measurements, start, gauge, None)
+        return cls(machine, start, *solved)
+
+    def estimate(self, measurements: Measurements) -> Estimate:
+        """Estimate by the same measurements, with their variance between imputations."""
+        gauge = default_gauge(self.machine)
+        return _estimate(self.machine, measurements, self.start, self.assembled, self.result, gauge)
+
+
 class Fit(NamedTuple):
     """Joint estimate without covariance.
 
@@ -610,14 +635,16 @@ def fit_state(
     measurements: Measurements,
     start: State,
     marginal_prior: MarginalPrior | None = None,
+    *,
+    scale_readings: bool = False,
 ) -> Fit:
-    """Robust joint estimate without covariance, for trials; the readings' noise is as stated.
+    """Robust joint estimate without covariance, for trials.
 
-    Arguments and errors are those of :func:`bundle`.
+    Arguments and errors are those of :func:`bundle`; the readings' noise is as stated by default.
     """
     gauge = default_gauge(machine)
     assembled, result = _assembled_fit(
-        machine, measurements, start, gauge, marginal_prior, scale_readings=False
+        machine, measurements, start, gauge, marginal_prior, scale_readings=scale_readings
     )
     problem = result.info.problem
     state = in_gauge(machine, state_of(assembled, result.solution.state, start), gauge)

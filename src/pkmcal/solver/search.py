@@ -352,9 +352,9 @@ class _Search(NamedTuple):
         self, accepted: Booleans, ratio: Array, size: Array, options: SearchOptions
     ) -> _Search:
         """Step control after a step; ratio : actual by predicted decrease of the cost."""
-        conditions = [ratio > least for least, _ in options.less_damping]
-        factors = [factor for _, factor in options.less_damping]
-        less = np.select(conditions, factors, options.more_damping)
+        less = np.full(ratio.shape, options.more_damping)
+        for least, factor in reversed(options.less_damping):
+            less = np.where(ratio > least, factor, less)
         damping = self.damping * np.where(accepted, less, self.growth)
         return _Search(
             np.clip(damping, options.least_damping, options.most_damping),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +47,7 @@ class StripLayout:
     linked: Integers | None = None
 
     @classmethod
+    @lru_cache(maxsize=64)  # each step of a search without strips needs its indices
     def none(cls, n_shared: int, n_own: int, count: int) -> StripLayout:
         """Layout without strips."""
         empty = np.zeros((0, 0), dtype=int)
