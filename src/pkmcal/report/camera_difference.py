@@ -33,6 +33,13 @@ ROTATION_TEXT = (
 
 def outcome_of(d: CameraDifference) -> Outcome:
     """Outcome of ``pkmcal diff`` of two cameras."""
+    # both cameras' parameters by their names
+    sides = [_values(one.camera) for one in (d.a, d.b)]
+    names = dict.fromkeys([*sides[0], *sides[1]])
+    none = (NO_VALUE_SIGN, NO_VALUE_SIGN)
+    rows = [Row(name, (*sides[0].get(name, none), *sides[1].get(name, none))) for name in names]
+    columns = ("Parameter", "A", "1σ", "B", "1σ")
+    note = "Parameters of two lenses differ where their projections do not: ξ with f, k1 with k2."
     return Outcome(
         command="diff",
         title="Difference of two cameras",
@@ -49,7 +56,7 @@ def outcome_of(d: CameraDifference) -> Outcome:
                 blocks=_maps(d),
                 tables=(_projection(d),),
             ),
-            Part("parameters", "Parameters", tables=(_parameters(d),)),
+            Part("parameters", "Parameters", tables=(Table("", columns, tuple(rows), note),)),
             Part("how", "How they were compared", (ROTATION_TEXT,)),
         ),
         document=d.as_dict(),
@@ -97,17 +104,6 @@ def _projection(d: CameraDifference) -> Table:
         rows.append(Row(name, tuple(texts)))
     columns = ("B's pixel minus A's, px", "Centre", "Median", "Worst")
     return Table("How far pixels differ", columns, tuple(rows))
-
-
-def _parameters(d: CameraDifference) -> Table:
-    """Table of both cameras' parameters by their names."""
-    sides = [_values(one.camera) for one in (d.a, d.b)]
-    names = dict.fromkeys([*sides[0], *sides[1]])
-    none = (NO_VALUE_SIGN, NO_VALUE_SIGN)
-    rows = [Row(name, (*sides[0].get(name, none), *sides[1].get(name, none))) for name in names]
-    columns = ("Parameter", "A", "1σ", "B", "1σ")
-    note = "Parameters of two lenses differ where their projections do not: ξ with f, k1 with k2."
-    return Table("", columns, tuple(rows), note)
 
 
 def _values(camera: Camera) -> dict[str, tuple[str, str]]:
