@@ -94,6 +94,7 @@ times as fast and enough where it shows the whole board, or by all."""
 
 Raw = tuple[Integers, Array]
 """Corner ids (n,) and pixels (n, 2) as a detector gives them."""
+NO_CORNERS: Raw = (np.zeros(0, dtype=int), np.zeros((0, 2)))
 
 
 def detect_board(
@@ -107,14 +108,18 @@ def detect_board(
 
     quick : only the first way of finding a chessboard.
     """
-    if board.type == "chessboard":
-        raw, mirrored, why = _chessboard(image, board, quick, options)
-    elif board.type == "charuco":
+    mirrored, why = False, ""
+    if board.type == "charuco":
         raw, mirrored, why = _charuco(image, board, options)
-    elif board.type == "circle_grid":
-        raw, mirrored, why = _circles(image, board)
-    else:
+    elif board.type == "aruco_grid":
         raw, mirrored, why = _marker_grid(image, board, options)
+    else:
+        if board.type == "chessboard":
+            pixels = find_chessboard(image, board.counts, quick, options=options)
+            why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners"
+        else:
+            pixels, why = find_circles(image, board), f"no grid like {board.described}"
+        raw = NO_CORNERS if pixels is None else (np.arange(len(pixels)), pixels)
     size = (image.shape[1], image.shape[0])
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     if len(raw[0]) < options.least_corners:
@@ -140,8 +145,7 @@ def detect_board(
 def _charuco(
     image: Integers, board: Board, options: BoardDetectionOptions
 ) -> tuple[Raw, bool, str]:
-    best: Raw = (np.zeros(0, dtype=int), np.zeros((0, 2)))
-    markers = 0
+    best, markers = NO_CORNERS, 0
     for mirrored, quick in DETECTION_ORDER:
         picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
         corners, ids, _, marker_ids = charuco_detector(board.document, quick).detectBoard(picture)
@@ -295,24 +299,7 @@ def _marker_grid(
             image, options.least_grid_markers, options
         ):
             break
-    return _raw([], [], 0, False), False, "fewer than two of the board's markers are detected"
-
-
-def _circles(image: Integers, board: Board) -> tuple[Raw, bool, str]:
-    centres = find_circles(image, board)
-    if centres is None:
-        return _raw([], [], 0, False), False, f"no grid like {board.described}"
-    return (np.arange(len(centres)), centres), False, ""
-
-
-def _chessboard(
-    image: Integers, board: Board, quick: bool, options: BoardDetectionOptions
-) -> tuple[Raw, bool, str]:
-    pixels = find_chessboard(image, board.counts, quick, options=options)
-    if pixels is None:
-        why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners"
-        return _raw([], [], 0, False), False, why
-    return (np.arange(len(pixels)), pixels), False, ""
+    return NO_CORNERS, False, "fewer than two of the board's markers are detected"
 
 
 def find_chessboard(
@@ -621,11 +608,6 @@ def _first(grey: Array, weight: Array, axes: Array, saddle: bool) -> Array:
     return np.stack([zero, zero, angle[:, 0], angle[:, 1], zero, mean, spread], axis=-1)
 
 
-def _directions(angle: Array) -> Array:
-    """Unit vectors (..., 2) along edges with these directions."""
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
 def _normals(angle: Array) -> Array:
     """Positive sides (..., 2) of edges with these directions."""
     return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
@@ -774,7 +756,8 @@ def _model(p: Array, shape: _Shape) -> tuple[Array, Array]:
     """
     from scipy.special import erf
 
-    directions, normals = _directions(p[:, 2:4]), _normals(p[:, 2:4])
+    angle = p[:, 2:4]
+    directions, normals = np.stack([np.cos(angle), np.sin(angle)], axis=-1), _normals(angle)
     blur, level, amplitude = np.sqrt(2) * np.exp(p[:, 4:5]), p[:, 5:6], p[:, 6:7]
     offsets = shape.offsets - p[:, :2, None]
     along, across = directions @ offsets, normals @ offsets

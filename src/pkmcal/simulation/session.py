@@ -195,10 +195,15 @@ def _write_texts(
     files = {
         name: "cameras/camera.yaml" if same else f"cameras/{name}.yaml" for name in truth.stations
     }
+    # readings, with the temperatures where there are any
+    columns, values = nominal.joint_names, truth.readings
+    if truth.effects is not None and truth.effects.temperature is not None:
+        columns = (*columns, "temperature [°C]")
+        values = np.column_stack([values, truth.effects.temperature])
     texts = {
         "mechanism.yaml": mechanism_text(nominal),
         "session.yaml": yaml_text(_session_document(settings, truth, files)),
-        "joints.csv": _readings_text(nominal, truth),
+        "joints.csv": csv_text(columns, truth.configurations, values),
         TRUTH_FILE: json.dumps(truth_document(truth), indent=1) + "\n",
     }
     if settings.board is not None:
@@ -209,15 +214,6 @@ def _write_texts(
         path = stage / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _readings_text(nominal: Machine, truth: Truth) -> str:
-    """joints.csv, with the temperatures where there are any."""
-    columns, values = nominal.joint_names, truth.readings
-    if truth.effects is not None and truth.effects.temperature is not None:
-        columns = (*columns, "temperature [°C]")
-        values = np.column_stack([values, truth.effects.temperature])
-    return csv_text(columns, truth.configurations, values)
 
 
 def _session_document(
