@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import THREADS, Array, Booleans, Integers, evenly
+from pkmcal.arrays import THREADS, Array, Booleans, Integers, evenly, rms
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.find import BOARD_DETECTION_OPTIONS, detect_board
 from pkmcal.boards.fit import (
@@ -327,7 +327,7 @@ def standing_board(views: BoardViews) -> Standing | None:
     _check_still(views, there, agreed)
     T_camera_board, covariance, rest = _mean_pose(views, agreed)
     off = there[agreed] - there[agreed].mean(axis=0)
-    scatter = float(np.sqrt(np.mean(off**2))) if agreed.sum() > 1 else float("nan")
+    scatter = rms(off) if agreed.sum() > 1 else float("nan")
     distance = _rms_distance(there, there[agreed].mean(axis=0))
     return Standing(
         T_camera_board,

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pkmcal.arrays import rms
 from pkmcal.control.simulation import ARRIVED_DISTANCE_SHARE
 from pkmcal.control.study import Study
 from pkmcal.levels import NEARLY_ALL, NEGLIGIBLE
@@ -88,7 +89,7 @@ def _by_hand(study: Study) -> Iterator[Finding]:
 
 def _noise(study: Study) -> tuple[Finding, ...]:
     direction = float(np.median(study.trials("true").runs.travel[:, 0]))
-    held = float(np.sqrt(np.mean(study.held.joints**2)))
+    held = rms(study.held.joints)
     if not direction > 0 or held < ARRIVED_DISTANCE_SHARE * direction:
         return ()
     return (doubtful("servo.noise", rms=held, law=study.plan.loop.law),)
