@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.kalibr import board_fields, is_kalibr_target
@@ -34,8 +34,6 @@ from pkmcal.files import (
 
 Count = Annotated[int, Field(ge=3, le=100)]
 Counts = tuple[Count, Count]
-InnerCorners = tuple[Annotated[int, Field(ge=3, le=100)], Annotated[int, Field(ge=3, le=100)]]
-Length = Annotated[Metres, Field(gt=0)]
 BoardSizeTolerance = Annotated[
     Share, Field(ge=0, le=0.05, description="standard deviation of the board's size, relative")
 ]
@@ -46,6 +44,20 @@ and printers' feeds differ by more. A board's own is the key ``tolerance`` of it
 (:func:`pkmcal.measurements.effects.board_sizes`)."""
 LONGEST_SQUARE_SIDE = 5.0
 """Longest side of a square or marker, m; a larger value was written in millimetres."""
+
+
+def _metres(length: float) -> float:
+    """Length if plausible in metres; raises FieldError beyond LONGEST_SQUARE_SIDE."""
+    if length > LONGEST_SQUARE_SIDE:
+        raise FieldError(
+            "this looks like millimetres",
+            found=f"{length:g}",
+            expected=f"{length * 1e-3:g}, or {length:g} mm",
+        )
+    return length
+
+
+Length = Annotated[Metres, Field(gt=0), AfterValidator(_metres)]
 
 
 class _Dictionary(Schema):
@@ -65,17 +77,6 @@ class _Dictionary(Schema):
         )
 
 
-def _metres(length: float) -> float:
-    """Length if plausible in metres; raises FieldError beyond LONGEST_SQUARE_SIDE."""
-    if length > LONGEST_SQUARE_SIDE:
-        raise FieldError(
-            "this looks like millimetres",
-            found=f"{length:g}",
-            expected=f"{length * 1e-3:g}, or {length:g} mm",
-        )
-    return length
-
-
 class CharucoSchema(_Dictionary):
     """ChArUco board, ``type: charuco``; ``legacy: true`` is OpenCV's pattern before 4.6 with even
     rows.
@@ -88,9 +89,9 @@ class CharucoSchema(_Dictionary):
     legacy: bool = False
     tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
 
-    @field_validator("square", "marker")
+    @field_validator("marker")
     @classmethod
-    def _in_metres(cls, length: float, info: ValidationInfo) -> float:
+    def _fits(cls, length: float, info: ValidationInfo) -> float:
         square = info.data.get("square")
         if square is not None and length >= square:
             raise FieldError(
@@ -98,14 +99,14 @@ class CharucoSchema(_Dictionary):
                 found=f"{length:g} m",
                 expected=f"less than the square's {square:g} m",
             )
-        return _metres(length)
+        return length
 
 
 class ChessboardSchema(Schema):
     """Chessboard, ``type: chessboard``, with either ``corners`` (inner ones) or ``squares``."""
 
     type: Literal["chessboard"]
-    corners: InnerCorners | None = None
+    corners: Counts | None = None
     squares: Counts | None = Field(default=None, validate_default=True)
     square: Length = Field(description="the length of a square's side in metres")
     tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
@@ -122,11 +123,6 @@ class ChessboardSchema(Schema):
                 " way",
             )
         return squares
-
-    @field_validator("square")
-    @classmethod
-    def _in_metres(cls, length: float) -> float:
-        return _metres(length)
 
 
 class GridSchema(_Dictionary):
@@ -147,11 +143,6 @@ class GridSchema(_Dictionary):
     ] = False
     tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
 
-    @field_validator("marker", "gap")
-    @classmethod
-    def _in_metres(cls, length: float) -> float:
-        return _metres(length)
-
 
 class CircleGridSchema(Schema):
     """Grid of circles, ``type: circle_grid``, as OpenCV has it: symmetric, or asymmetric with every
@@ -166,11 +157,6 @@ class CircleGridSchema(Schema):
     )
     asymmetric: bool = False
     tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
-
-    @field_validator("spacing")
-    @classmethod
-    def _in_metres(cls, length: float) -> float:
-        return _metres(length)
 
 
 BOARD_SCHEMAS: dict[str, type[Schema]] = {

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import THREADS, Array, Booleans, Integers, evenly
+from pkmcal.arrays import THREADS, Array, Booleans, Integers, evenly, rms
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.find import BOARD_DETECTION_OPTIONS, detect_board
 from pkmcal.boards.fit import (
@@ -317,12 +317,17 @@ def standing_board(views: BoardViews) -> Standing | None:
     if not views.usable.any():
         return None
     there, noise = _projected_corners(views)
-    agreed = _consistent_images(there, noise, views.usable, views.options)
+    # the largest set of images that agree with one of them
+    limit = np.sqrt(
+        views.options.still**2 + views.options.moved**2 * (noise[:, None] ** 2 + noise**2)
+    )
+    agree = (_rms_distance(there[:, None], there) <= limit) & views.usable & views.usable[:, None]
+    agreed = agree[int(np.argmax(agree.sum(axis=1)))]
     odd = views.usable & ~agreed
     _check_still(views, there, agreed)
     T_camera_board, covariance, rest = _mean_pose(views, agreed)
     off = there[agreed] - there[agreed].mean(axis=0)
-    scatter = float(np.sqrt(np.mean(off**2))) if agreed.sum() > 1 else float("nan")
+    scatter = rms(off) if agreed.sum() > 1 else float("nan")
     distance = _rms_distance(there, there[agreed].mean(axis=0))
     return Standing(
         T_camera_board,
@@ -350,15 +355,6 @@ def _projected_corners(views: BoardViews) -> tuple[Array, Array]:
     by_pose = np.concatenate([-by_point @ skew(there - T[..., :3, 3]), by_point], axis=-1)
     variance = np.einsum("fnip,fpq,fniq->fni", by_pose, views.poses.covariance, by_pose)
     return views.camera.project(there), np.sqrt(np.nanmean(variance, axis=(1, 2)))
-
-
-def _consistent_images(
-    there: Array, noise: Array, usable: Booleans, options: BoardPoseOptions
-) -> Booleans:
-    """Largest set of images (F,) that agree with one of them."""
-    limit = np.sqrt(options.still**2 + options.moved**2 * (noise[:, None] ** 2 + noise**2))
-    agree = (_rms_distance(there[:, None], there) <= limit) & usable & usable[:, None]
-    return agree[int(np.argmax(agree.sum(axis=1)))]
 
 
 def _rms_distance(there: Array, other: Array) -> Array:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, evenly, rms
 from pkmcal.calibration.holdout import points_of_poses
 from pkmcal.geometry.cylinders import contour_point, line_through
 from pkmcal.geometry.rigid import apply, dot, skew
@@ -220,7 +220,7 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
         (READING_ROWS,),
     )
     step = np.diff(joints, axis=0, prepend=joints[:1])
-    size = float(np.sqrt(np.mean(step[used] ** 2)))
+    size = rms(step[used])
     if size > 0:
         sign, step = np.sign(step), step / size
         alone = np.concatenate([x[:, :, None] * each for x in (sign, step)], axis=2)
@@ -254,9 +254,7 @@ def smooth_functions(
     """
     size = float(np.sqrt(np.mean(np.sum(points**2, axis=1))))
     points = points / (size or 1.0)
-    marks = points[
-        np.unique(np.linspace(0, len(points) - 1, DISCREPANCY_BASIS.landmarks).astype(int))
-    ]
+    marks = points[evenly(len(points), DISCREPANCY_BASIS.landmarks)]
 
     def kernel(one: Array, length: float) -> Array:
         squares = np.sum((one[:, None] - marks) ** 2, axis=-1)

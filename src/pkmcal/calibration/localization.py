@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import THREADS, Array, Booleans, Integers
+from pkmcal.arrays import THREADS, Array, Booleans, Integers, rms
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
@@ -174,7 +174,7 @@ def _closing_misfit(session: Session, joints: Array) -> float:
     miss = fk.error / _allowed_leg_miss(machine, fk)
     blocked = np.abs(_turn(fk.T_base_platform)) > machine.most_turn[0]
     miss = np.where(blocked | ~(miss < VERDICT.too_noisy), VERDICT.too_noisy, miss)
-    return float(np.sqrt(np.mean(miss**2)))
+    return rms(miss)
 
 
 def _allowed_leg_miss(machine: Machine, fk: ForwardResult) -> Array:

@@ -101,7 +101,7 @@ def tool(error: ToolAccuracy, ax: Axes | None = None) -> Axes:
     ax.set_ylim(axis.limits)
     ax.set_yticks([tick.at for tick in axis.ticks], [tick.label for tick in axis.ticks])
     ax.set_yticks([], minor=True)
-    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.locator_params(axis="x", integer=True)
     ax.set_xlabel("poses, the best known first")
     ax.set_ylabel(axis.label)
     ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2)

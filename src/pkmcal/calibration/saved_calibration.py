@@ -29,7 +29,7 @@ from pkmcal.calibration.summary import CalibrationSummary, Overview
 from pkmcal.cameras.response import Response
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, given_path, read_json, validated_document
-from pkmcal.geometry.rigid import inverse
+from pkmcal.geometry.rigid import inverse, is_rigid
 from pkmcal.identify.estimate import Statistics
 from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine, with_exact_scales
@@ -581,10 +581,7 @@ def _check_poses(document: Document, group: str, key: str, items: tuple[Any, ...
     for k, item in enumerate(items):
         if (rows := getattr(item, key)) is None:
             continue
-        matrix = np.array(rows)
-        rot = matrix[:3, :3]
-        rigid = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
-        if not rigid or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        if not is_rigid(np.array(rows)):
             raise _edited(document, f"{group}[{k + 1}].{key}", "a rotation and a translation")
 
 

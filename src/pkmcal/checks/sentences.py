@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, rms
 from pkmcal.checks.advice import forecast_figure, forecast_part
 from pkmcal.checks.forecast import NEAR_END
 from pkmcal.checks.results import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
@@ -86,7 +86,7 @@ def link_findings(session: Session, poses: Array | None) -> list[Finding]:
             first, second = (poses[links.configuration[:, k]][None] for k in (0, 1))
             still = np.broadcast_to(np.eye(4), (1, len(links), 4, 4))
             rows = links.rows(first, second, still).value[0] * links.sigma
-            off["rms"] = float(np.sqrt(np.mean(rows**2)))
+            off["rms"] = rms(rows)
         joined = len(np.unique(links.configuration))
         out.append(
             note("session.links", links.label, links=count(len(links), kind.one), number=joined,

@@ -176,15 +176,10 @@ def _as_pkmcal_error(error: BaseException, words: list[str]) -> tuple[PkmcalErro
             next_step="Close other programs, or use fewer or smaller images",
         )
         return message, message.exit_code
-    if isinstance(error, OSError):  # no space, no permission, a disk taken away
-        from pkmcal.files import next_step_after
+    if isinstance(error, OSError):
+        from pkmcal.files import refused_by_system
 
-        reason = (error.strerror or str(error) or type(error).__name__).lower()
-        message = InputError(
-            f"the operating system refused: {reason}",
-            where=str(error.filename) if error.filename else None,
-            next_step=next_step_after(error),
-        )
+        message = refused_by_system(error)
         return message, message.exit_code
     defect = PkmcalError(
         f"this is a defect of pkmcal, not of your session: {type(error).__name__}: {error}",

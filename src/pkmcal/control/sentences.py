@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from pkmcal.arrays import rms
 from pkmcal.control.simulation import ARRIVED_DISTANCE_SHARE
-from pkmcal.control.study import Study, Trials
+from pkmcal.control.study import Study
 from pkmcal.levels import NEARLY_ALL, NEGLIGIBLE
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, wrong
@@ -18,57 +19,39 @@ from pkmcal.wording import named
 def judgement(study: Study) -> Verdict:
     """Verdict on a study: headline and findings."""
     own, good = study.visibility, study.trials("identified")
-    reasons = (*_blind(study), *_failures(good))
-    share = good.reached / len(good.runs.end)
-    usable = not own.blind and share >= NEARLY_ALL
-    law = study.plan.loop.law
-    legs = observed_legs(study)
+    law, legs, n = study.plan.loop.law, observed_legs(study), len(good.runs.end)
+    reasons = [wrong("servo.blind", legs, law=law, legs=legs)] if own.blind else []
+    reasons += [
+        wrong("servo.failures", number=count, of=n, end=end.sentence)
+        for end, count in good.ends.items()
+        if not end.good
+    ]
+    usable = not own.blind and good.reached / n >= NEARLY_ALL
     headline = (
         f"Control by the {law} of {legs} brings the platform to its goal in {good.reached} of"
-        f" {len(good.runs.end)} runs with the identified geometry."
+        f" {n} runs with the identified geometry."
     )
     if not usable:
         why = (
             "these legs do not show every motion of the platform."
             if own.blind
-            else f"{good.reached} of {len(good.runs.end)} runs reach the goal."
+            else f"{good.reached} of {n} runs reach the goal."
         )
         headline = f"Control by the {law} of {legs} should not be used: {why}"
-    warnings = (*_fading(study), *_hidden(study), *_by_hand(study), *_noise(study))
     if usable:
-        reasons = tuple(replace(one, level=Level.DOUBTFUL) for one in reasons)
-    return Verdict(usable, headline, (*reasons, *warnings, *_advice(study)))
+        reasons = [replace(one, level=Level.DOUBTFUL) for one in reasons]
+    findings = [*reasons, *_hidden(study), *_by_hand(study), *_noise(study)]
+    if own.fading and not own.blind:
+        fading = doubtful("servo.fading", legs, legs=legs, percent=100 * own.worst / own.usual)
+        findings.insert(len(reasons), fading)
+    if own.blind and law == "directions":  # which do not determine every motion
+        findings.append(note("servo.by_edges"))
+    return Verdict(usable, headline, tuple(findings))
 
 
 def observed_legs(study: Study) -> str:
     """Observed legs as text: ``all legs``, ``legs 1, 3 and 5``."""
     return named(study.eye.true.legs.tolist(), study.scene.machine.n_legs)
-
-
-def _blind(study: Study) -> tuple[Finding, ...]:
-    """Finding on motions that are unobservable."""
-    if not study.visibility.blind:
-        return ()
-    law, legs = study.plan.loop.law, observed_legs(study)
-    return (wrong("servo.blind", legs, law=law, legs=legs),)
-
-
-def _failures(outcome: Trials) -> tuple[Finding, ...]:
-    """Findings on failed runs, the most frequent end first."""
-    n = len(outcome.runs.end)
-    return tuple(
-        wrong("servo.failures", number=count, of=n, end=end.sentence)
-        for end, count in outcome.ends.items()
-        if not end.good
-    )
-
-
-def _fading(study: Study) -> tuple[Finding, ...]:
-    own = study.visibility
-    if own.blind or not own.fading:
-        return ()
-    legs = observed_legs(study)
-    return (doubtful("servo.fading", legs, legs=legs, percent=100 * own.worst / own.usual),)
 
 
 def _hidden(study: Study) -> tuple[Finding, ...]:
@@ -106,13 +89,7 @@ def _by_hand(study: Study) -> Iterator[Finding]:
 
 def _noise(study: Study) -> tuple[Finding, ...]:
     direction = float(np.median(study.trials("true").runs.travel[:, 0]))
-    held = float(np.sqrt(np.mean(study.held.joints**2)))
+    held = rms(study.held.joints)
     if not direction > 0 or held < ARRIVED_DISTANCE_SHARE * direction:
         return ()
     return (doubtful("servo.noise", rms=held, law=study.plan.loop.law),)
-
-
-def _advice(study: Study) -> tuple[Finding, ...]:
-    """Finding on the other law, if the directions do not determine every motion."""
-    blind = study.visibility.blind and study.plan.loop.law == "directions"
-    return (note("servo.by_edges"),) if blind else ()

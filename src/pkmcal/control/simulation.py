@@ -265,7 +265,12 @@ def simulate_servo_runs(
     wanted = eye.normals(eye.points(goals, np.nan_to_num(goal_readings)), NO_EDGE_NOISE, rng)
     now = _begin(eye, starts, goals)
     record = _Record.empty(eye.true.machine, starts, goals, now.readings.shape[-1], loop.samples)
-    floor = _floor(eye, goals, np.nan_to_num(goal_readings), loop, rng)
+    # distance of the platform's joints from the goal that is due to noise alone
+    still = one_image(
+        eye, eye.true, loop.law, goals, np.nan_to_num(goal_readings), loop.noise, rng, draws=8
+    )
+    part = loop_factor(loop.gain / loop.rate, loop.delay)
+    floor = np.nan_to_num(OUTLIER_SIGMAS * still.joints * (part if np.isfinite(part) else 0.0))
     queue: list[tuple[Array, Array]] = []
     # each sample: record, image with noise, delay, motor velocities, motion
     for k in range(loop.samples):
@@ -411,15 +416,6 @@ class _Record:
             time, self.error, self.travel, self.past, self.poses, self.readings, tuple(ends), last,
             goals,
         )  # fmt: skip
-
-
-def _floor(
-    eye: Eye, goals: Array, readings: Array, loop: LoopSettings, rng: np.random.Generator
-) -> Array:
-    """Distance (R,), in m, of the platform's joints from the goal that is due to noise alone."""
-    still = one_image(eye, eye.true, loop.law, goals, readings, loop.noise, rng, draws=8)
-    part = loop_factor(loop.gain / loop.rate, loop.delay)
-    return np.nan_to_num(OUTLIER_SIGMAS * still.joints * (part if np.isfinite(part) else 0.0))
 
 
 def _judged(error: Array, direction: Array, loop: LoopSettings, floor: Array) -> list[End]:

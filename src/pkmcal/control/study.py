@@ -313,12 +313,18 @@ def outcome(true: Machine, estimate: Belief, runs: ServoRuns, ideal: ServoRuns) 
     past = np.where(last, runs.past, 0.0)
     lowest = np.minimum.accumulate(runs.error, axis=1)
     first = np.maximum(runs.error[:, :1], 1e-300)
+    # time after which the platform stays within ARRIVED_DISTANCE_SHARE of its path
+    far = runs.travel > ARRIVED_DISTANCE_SHARE * runs.travel[:, :1]
+    n = far.shape[1]
+    after = n - np.argmax(far[:, ::-1], axis=1)
+    after = np.where(far.any(axis=1), after, 0)
+    time = np.append(runs.time, np.nan)[after]
     return Trials(
         estimate,
         runs,
         overshoot=np.maximum(past.max(axis=1), 0.0),
         rise=np.max((runs.error - lowest) / first, axis=1),
-        settling=_settling(runs),
+        settling=np.where(runs.reached, time, np.nan),
         astray=_astray(true, runs, ideal),
     )
 
@@ -336,18 +342,6 @@ def _astray(machine: Machine, runs: ServoRuns, ideal: ServoRuns) -> Array:
         off = here[:, None] - there
         out[r] = np.sqrt(np.mean(dot(off, off), axis=-1).min(axis=1).max())
     return out
-
-
-def _settling(runs: ServoRuns) -> Array:
-    """Time (R,) after which the platform stays within ARRIVED_DISTANCE_SHARE of its path,
-    or NaN.
-    """
-    far = runs.travel > ARRIVED_DISTANCE_SHARE * runs.travel[:, :1]
-    n = far.shape[1]
-    after = n - np.argmax(far[:, ::-1], axis=1)
-    after = np.where(far.any(axis=1), after, 0)
-    time = np.append(runs.time, np.nan)[after]
-    return np.where(runs.reached, time, np.nan)
 
 
 def _ways(eye: Eye, plan: Plan, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -522,7 +522,8 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     """Start of the fit: the machine as an ideal delta, with the circle through the three hinges."""
     hinge = MM_A_METRE * delta.hinge
     # circle through the hinges, and the order of the legs by their directions
-    centre = _circle(hinge[:, :2])
+    d = hinge[1:, :2] - hinge[0, :2]
+    centre = hinge[0, :2] + np.linalg.solve(2 * d, np.sum(d**2, axis=1))
     away = hinge[:, :2] - centre
     azimuth = np.arctan2(away[:, 1], away[:, 0]) * DEGREES_A_RADIAN
     nominal = np.array(freedoms.nominal)
@@ -587,12 +588,6 @@ def _order(azimuth: Array, nominal: Array) -> Integers:
 def _wrapped(angle: Array) -> Array:
     """Angle in [-180, 180) degrees."""
     return (angle + 180) % 360 - 180
-
-
-def _circle(points: Array) -> Array:
-    """Centre (2,) of the circle through three points (3, 2)."""
-    d = points[1:] - points[0]
-    return points[0] + np.linalg.solve(2 * d, np.sum(d**2, axis=1))
 
 
 # Texts of the files

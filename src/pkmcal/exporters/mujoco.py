@@ -10,12 +10,12 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.exporters.agreement import differences
-from pkmcal.exporters.bodies import BODY_COLOURS, BodyTree, Loop, RoundBar, TreeBody, body_tree
+from pkmcal.exporters.bodies import BODY_COLOURS, BodyTree, RoundBar, TreeBody, body_tree
 from pkmcal.exporters.contract import Difference, Exporter
 from pkmcal.exporters.home import HomeState
 from pkmcal.exporters.markup import comment, comment_text, document, file_name, numbers_text
 from pkmcal.exporters.mujoco_read import read_mujoco
-from pkmcal.geometry.rigid import quaternion
+from pkmcal.geometry.rigid import pose, quaternion
 from pkmcal.outcome.finding import Finding, note
 
 MUJOCO_TIME_STEP = "0.001"
@@ -87,7 +87,14 @@ def _mjcf(source: MachineSource) -> str:
         if not loop.hinges:
             out.set("anchor", numbers_text(loop.point))
     _drives(root, home)
-    _keyframe(root, home)
+    # the keyframe at home: values of all joints in MuJoCo's order, that of the text
+    parts = root.iterfind("worldbody/")
+    values = [n.get("ref", "0.0") for part in parts for n in part.iter("joint")]
+    free = next((n for n in root.iter("body") if n.find("freejoint") is not None), None)
+    if free is not None:  # the platform comes first
+        values[:0] = [free.get("pos", "0 0 0"), free.get("quat", "1 0 0 0")]
+    key = SubElement(SubElement(root, "keyframe"), "key", name="home", qpos=" ".join(values))
+    key.set("ctrl", numbers_text(home.readings))
     return document(root, source, CONVENTIONS)
 
 
@@ -119,16 +126,11 @@ def _fill(node: Element, body: TreeBody, tree: BodyTree) -> None:
         _fill(made, child, tree)
     for loop in tree.loops:
         if loop.hinges and loop.tip is body:
-            _end(node, loop, tree.home.size / 10)
-
-
-def _end(node: Element, loop: Loop, size: float) -> None:
-    """Add the body with a loop joint's own hinges, to which the platform is welded."""
-    place = np.eye(4)
-    place[:3, 3] = loop.end
-    last = _body(node, f"{loop.name}_end", place, MUJOCO_PART_MASS, np.zeros(3), size)
-    for kind, axis in loop.hinges:
-        _joint(last, f"{loop.name}_{kind}", "hinge", axis)
+            # a body with the loop joint's own hinges, to which the platform is welded
+            place, size = pose(np.eye(3), loop.end), tree.home.size / 10
+            last = _body(node, f"{loop.name}_end", place, MUJOCO_PART_MASS, np.zeros(3), size)
+            for kind, axis in loop.hinges:
+                _joint(last, f"{loop.name}_{kind}", "hinge", axis)
 
 
 def _body(parent: Element, name: str, T: Array, mass: float, middle: Array, size: float) -> Element:
@@ -207,14 +209,3 @@ def _drives(root: Element, home: HomeState) -> None:
         SubElement(sensor, "actuatorpos", name=name, actuator=name)
     for kind, name in (("framepos", "platform_position"), ("framequat", "platform_quaternion")):
         SubElement(sensor, kind, name=name, objtype="xbody", objname="platform")
-
-
-def _keyframe(root: Element, home: HomeState) -> None:
-    """Add the keyframe at home: values of all joints in MuJoCo's order, that of the text."""
-    world = root.iterfind("worldbody/")
-    values = [n.get("ref", "0.0") for part in world for n in part.iter("joint")]
-    free = next((n for n in root.iter("body") if n.find("freejoint") is not None), None)
-    if free is not None:  # the platform comes first
-        values[:0] = [free.get("pos", "0 0 0"), free.get("quat", "1 0 0 0")]
-    key = SubElement(SubElement(root, "keyframe"), "key", name="home", qpos=" ".join(values))
-    key.set("ctrl", numbers_text(home.readings))

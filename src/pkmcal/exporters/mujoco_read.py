@@ -112,7 +112,10 @@ def _include(root: Element, folder: Path | None) -> None:
     while found := [(parent, node) for parent in root.iter() for node in parent.findall("include")]:
         for parent, node in found:
             name = attribute(node, "file")
-            if folder is None or not _is_below(folder, name):
+            # the file is in the folder or below it, wherever its links lead
+            if folder is None or not Path(os.path.realpath(folder / name)).is_relative_to(
+                os.path.realpath(folder)
+            ):
                 raise refused(
                     node, "a file from elsewhere is not included", name, "one beside the document"
                 )
@@ -128,11 +131,6 @@ def _include(root: Element, folder: Path | None) -> None:
             at = list(parent).index(node)
             parent[at : at + 1] = list(inside)
         check_size(root)
-
-
-def _is_below(folder: Path, name: str) -> bool:
-    """Whether a file is in a folder or below it, wherever its links lead."""
-    return Path(os.path.realpath(folder / name)).is_relative_to(os.path.realpath(folder))
 
 
 def _replicate(root: Element) -> None:

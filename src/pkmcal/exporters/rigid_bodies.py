@@ -77,7 +77,14 @@ class RigidBodies:
 
 def rigid_bodies(model: ReadModel) -> RigidBodies:
     """Rigid bodies of a model, closed from its key, and the joints between them."""
-    x, rigid = _closed_state(model), _rigid(model)
+    # bodies without joints are one with their parents, as are bodies that a loop holds as poses
+    pairs = [(k, body.parent) for k, body in enumerate(model.bodies) if not body.joints]
+    pairs += [loop.bodies for loop in model.loops if loop.rigid]
+    rigid = list(range(len(model.bodies)))
+    for pair in pairs:
+        low, high = sorted(rigid[body] for body in pair)
+        rigid = [low if r == high else r for r in rigid]
+    x = _closed_state(model)
     at, edges = body_poses(model.bodies, x), list[Edge]()
     for k, body in enumerate(model.bodies):
         if body.joints and body.joints[0].kind != "free":
@@ -90,7 +97,7 @@ def rigid_bodies(model: ReadModel) -> RigidBodies:
             edges.append(Edge(first, second, (Step("ball", np.zeros(3), point, -1),)))
     if not edges:
         raise InputError("the model has no joints", found=f"{len(model.bodies) - 1} bodies")
-    return RigidBodies(model, x, at, rigid, tuple(edges))
+    return RigidBodies(model, x, at, tuple(rigid), tuple(edges))
 
 
 def _closed_state(model: ReadModel) -> Array:
@@ -104,19 +111,6 @@ def _closed_state(model: ReadModel) -> Array:
             "the loops do not close", found=f"a gap of {gap:.2g} m", expected="none at home"
         )
     return x
-
-
-def _rigid(model: ReadModel) -> tuple[int, ...]:
-    """First body of the rigid body that each belongs to: bodies without joints, and bodies that a
-    loop holds as poses, are one.
-    """
-    pairs = [(k, body.parent) for k, body in enumerate(model.bodies) if not body.joints]
-    pairs += [loop.bodies for loop in model.loops if loop.rigid]
-    out = list(range(len(model.bodies)))
-    for pair in pairs:
-        low, high = sorted(out[body] for body in pair)
-        out = [low if r == high else r for r in out]
-    return tuple(out)
 
 
 def _steps(model: ReadModel, at: Sequence[Array], x: Array, k: int) -> list[Step]:

@@ -56,7 +56,12 @@ class Ros(Exporter):
         for station, camera in source.cameras.items():
             if _has_ros_model(camera):
                 name = f"camera_info_{frames[station]}.yaml"
-                out[name] = _camera_info(source, station, frames[station])
+                text = foreign_text(camera, f"{frames[station]}.yaml", "ros")
+                about = source.header(
+                    f"Camera of station {station}; pixels, pixel centres at integers, frame"
+                    f" {frames[station]}_optical_frame."
+                )
+                out[name] = commented(about, "#") + text
         return out
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
@@ -148,16 +153,6 @@ def _launch(source: MachineSource) -> str:
         ),
     )
     return commented(about, "#") + "launch:\n" + "".join(nodes)
-
-
-def _camera_info(source: MachineSource, station: str, frame: str) -> str:
-    """ROS camera file; its camera_name is the name of the frame."""
-    text = foreign_text(source.cameras[station], f"{frame}.yaml", "ros")
-    about = source.header(
-        f"Camera of station {station}; pixels, pixel centres at integers, frame"
-        f" {frame}_optical_frame."
-    )
-    return commented(about, "#") + text
 
 
 def transforms(text: str) -> dict[str, Array]:

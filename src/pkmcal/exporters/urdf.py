@@ -132,7 +132,12 @@ def _steps(body: TreeBody) -> Iterator[tuple[str, BodyJoint | None, Array]]:
         return
     joints, origin = list(body.joints), body.T_parent_body
     if body.free:  # the joints' values are the components of the pose in the base frame
-        joints = _pose_joints(body.T_parent_body)
+        axes = np.eye(3)[[0, 1, 2, 2, 1, 0]]
+        values = [*body.T_parent_body[:3, 3], *roll_pitch_yaw(body.T_parent_body[:3, :3])[::-1]]
+        joints = [
+            BodyJoint(f"platform_{name}", "slide" if name in "xyz" else "hinge", axis, float(value))
+            for name, axis, value in zip(POSE_JOINTS, axes, values, strict=True)
+        ]
     if not joints:
         yield body.name, None, origin
     for k, joint in enumerate(joints):
@@ -142,16 +147,6 @@ def _steps(body: TreeBody) -> Iterator[tuple[str, BodyJoint | None, Array]]:
         link = body.name if k == len(joints) - 1 else f"{joint.name}_link"
         yield link, joint, np.eye(4) if body.free else origin @ zero
         origin = np.eye(4)
-
-
-def _pose_joints(T: Array) -> list[BodyJoint]:
-    """Joints in series for the six components of a pose (4, 4) in the base frame."""
-    axes = np.eye(3)[[0, 1, 2, 2, 1, 0]]
-    values = [*T[:3, 3], *roll_pitch_yaw(T[:3, :3])[::-1]]
-    return [
-        BodyJoint(f"platform_{name}", "slide" if name in "xyz" else "hinge", axis, float(value))
-        for name, axis, value in zip(POSE_JOINTS, axes, values, strict=True)
-    ]
 
 
 def _joint(

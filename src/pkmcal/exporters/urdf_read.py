@@ -71,7 +71,15 @@ def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadMode
     root = xml_root(text)
     beside = validated_document(parse_yaml(loops, Path(loops_name)), LoopsDocument)
     tree = _Tree(root, loops_name)
-    couplings = _couplings(root, tree)
+    couplings: list[ReadCoupling] = []
+    for node in root.findall("joint"):
+        if (mimic := node.find("mimic")) is not None:
+            ratio = float(vector(mimic, "multiplier", "1", 1)[0])
+            offset = float(vector(mimic, "offset", "0", 1)[0])
+            follower, leader = attribute(node, "name"), attribute(mimic, "joint")
+            couplings.append(
+                ReadCoupling(tree.joint(follower).dof, tree.joint(leader).dof, ratio, offset)
+            )
     # the state at home
     key = np.zeros(len(tree.joints))
     for name, value in beside.home.items():
@@ -92,7 +100,7 @@ def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadMode
             )
             for loop in beside.loops
         ),
-        couplings=couplings,
+        couplings=tuple(couplings),
         sites={name: (body, np.zeros(3)) for name, body in sites.items()},
         cylinders=tuple(
             _cylinder(visual, cylinder, tree.numbers[name])
@@ -170,20 +178,6 @@ class _Tree:
             self.bodies.append(ReadBody(link, parent, _origin_pose(node), own))
         self.numbers[link] = len(self.bodies) - 1
         return self.numbers[link]
-
-
-def _couplings(root: Element, tree: _Tree) -> tuple[ReadCoupling, ...]:
-    """Joints that follow others."""
-    out: list[ReadCoupling] = []
-    for node in root.findall("joint"):
-        if (mimic := node.find("mimic")) is not None:
-            ratio = float(vector(mimic, "multiplier", "1", 1)[0])
-            offset = float(vector(mimic, "offset", "0", 1)[0])
-            follower, leader = attribute(node, "name"), attribute(mimic, "joint")
-            out.append(
-                ReadCoupling(tree.joint(follower).dof, tree.joint(leader).dof, ratio, offset)
-            )
-    return tuple(out)
 
 
 def _joint(node: Element, dof: int) -> ReadJoint:

@@ -50,7 +50,7 @@ from pkmcal.files.quantities import (
     no_such,
     written_unit,
 )
-from pkmcal.files.refusals import next_step_after
+from pkmcal.files.refusals import refused_by_system
 from pkmcal.files.regular import check_regular, given_path, resolved
 from pkmcal.files.schema import FieldError, Schema, validated_document
 from pkmcal.files.tables import CsvTable, PairTable, csv_text, read_csv, read_pairs
@@ -109,7 +109,6 @@ __all__ = [
     "given_path",
     "json_text",
     "json_value",
-    "next_step_after",
     "no_such",
     "open_image",
     "output_lock",
@@ -122,6 +121,7 @@ __all__ = [
     "read_pairs",
     "read_text",
     "read_yaml",
+    "refused_by_system",
     "remember",
     "remember_arrays",
     "remembered",

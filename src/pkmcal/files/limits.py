@@ -43,9 +43,7 @@ MOST_FAULTS_NAMED = 50
 """Faults of one file that are examined closely; the others are reported once these are fixed."""
 
 
-def check_count(
-    number: int, most: int, what: str, where: str | None = None, next_step: str | None = None
-) -> None:
+def check_count(number: int, most: int, what: str, where: str | None = None) -> None:
     """Raise `InputError` where a number exceeds its limit; what : in the plural, "stations"."""
     if number > most:
         raise InputError(
@@ -53,5 +51,4 @@ def check_count(
             where=where,
             found=str(number),
             expected=f"at most {most}",
-            next_step=next_step,
         )

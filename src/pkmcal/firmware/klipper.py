@@ -56,6 +56,7 @@ from pkmcal.firmware.klipper_probing import (
     saved_distances,
     saved_touches,
 )
+from pkmcal.firmware.towers import nozzle_heights
 from pkmcal.outcome.finding import Finding, note
 
 ROTARY_ANGLES = (30.0, 150.0, 270.0)
@@ -164,7 +165,7 @@ class Klipper(Firmware):
         radius = self.print_radius(fit)
         if fit.kind == "linear":
             names = [f"stepper_{s}.position_endstop" for s in KLIPPER_STEPPERS]
-            lines += proportional_switches(fit, names, _tower_endstops(fit))
+            lines += proportional_switches(fit, names, nozzle_heights(fit))
             if radius is None:
                 lines.append(NO_KLIPPER_PRINT_RADIUS)
             sections = _linear(fit, radius)
@@ -192,7 +193,7 @@ class Klipper(Firmware):
         if fit.kind == "linear":
             common = (("delta_radius", fit.radius),)
             each = (("arm_length", fit.rod, "mm"), ("angle", fit.angle, "degrees"),
-                    ("position_endstop", _tower_endstops(fit), "mm"))  # fmt: skip
+                    ("position_endstop", nozzle_heights(fit), "mm"))  # fmt: skip
         else:
             common = (("shoulder_radius", fit.radius), ("shoulder_height", fit.height[0]))
             each = (("upper_arm_length", fit.arm, "mm"), ("lower_arm_length", fit.rod, "mm"),
@@ -303,14 +304,9 @@ def _probe_offset(config: KlipperConfig) -> tuple[float, float, float]:
 # Writing
 
 
-def _tower_endstops(fit: Fit) -> Array:
-    """Heights (3,) mm of the tool at which the towers' switches trigger."""
-    return fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
-
-
 def _linear(fit: Fit, radius: str | None) -> dict[str, dict[str, str]]:
     """Sections of a linear delta."""
-    endstops = _tower_endstops(fit)
+    endstops = nozzle_heights(fit)
     sections = {
         "printer": {
             "kinematics": "delta",

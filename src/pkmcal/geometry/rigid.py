@@ -33,6 +33,13 @@ VectorLike = Array | Sequence[float]
 """(3,) numbers."""
 
 
+def is_rigid(T: Array) -> bool:
+    """Whether a matrix (4, 4) is a rotation, to 1e-6, and a translation."""
+    rot = T[:3, :3]
+    rotates = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
+    return bool(rotates and np.array_equal(T[3], [0, 0, 0, 1]))
+
+
 def skew(v: Array) -> Array:
     """Cross-product matrices, (..., 3) -> (..., 3, 3): ``skew(v) @ w == cross(v, w)``."""
     v = np.asarray(v)

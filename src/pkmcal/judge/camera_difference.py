@@ -141,7 +141,11 @@ def camera_difference(a: Camera | Path | str, b: Camera | Path | str) -> CameraD
     sigma, chance = None, None
     if floor > 0:
         spread = _spread(one.camera, other.camera, pixels[both], rays[both], R)
-        spread = _without_rotation(spread, other.camera, rotated, weight)
+        # projected orthogonally to the effect of a rotation
+        w = weight[:, None, None]
+        basis = np.linalg.qr((w * _by_rotation(other.camera, rotated)).reshape(-1, 3))[0]
+        flat = (w * spread).reshape(-1, spread.shape[-1])
+        spread = (flat - basis @ (basis.T @ flat)).reshape(spread.shape) / w
         sigma = np.full(pixels.shape[:-1], np.nan)
         sigma[both] = largest_sigma(spread @ spread.mT)
         chance = _p_value(off, spread, weight)
@@ -196,14 +200,6 @@ def _spread(a: Camera, b: Camera, pixels: Array, rays: Array, R: Array) -> Array
         values, vectors = np.linalg.eigh(covariance)
         parts.append(by @ (vectors * np.sqrt(np.maximum(values, 0.0))))
     return np.concatenate(parts, axis=-1)
-
-
-def _without_rotation(spread: Array, camera: Camera, rays: Array, weight: Array) -> Array:
-    """Columns of changes (n, 2, m), projected orthogonally to the effect of a rotation."""
-    w = weight[:, None, None]
-    basis = np.linalg.qr((w * _by_rotation(camera, rays)).reshape(-1, 3))[0]
-    flat = (w * spread).reshape(-1, spread.shape[-1])
-    return (flat - basis @ (basis.T @ flat)).reshape(spread.shape) / w
 
 
 def _p_value(off: Array, spread: Array, weight: Array) -> float:

@@ -324,7 +324,11 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
     lower = np.linalg.cholesky(0.5 * (spread + spread.T))
     for k, station in enumerate(stations):
         at = n + n_cameras + 6 * k
-        by[:, at : at + 6] = by[:, at : at + 6] @ _by_camera(state.T_camera_base[0, station])
+        # by a rotation phi and a motion s of the camera along its own axes, after which points
+        # are Exp(-phi) (p - s) in its frame
+        by_camera = -np.eye(6)
+        by_camera[3:, :3] = skew(state.T_camera_base[0, station, :3, 3])
+        by[:, at : at + 6] = by[:, at : at + 6] @ by_camera
     return Evidence(np.linalg.solve(lower, projected), np.linalg.solve(lower, by), stations)
 
 
@@ -344,15 +348,6 @@ def _with_fixed_stations(
     off = pose_difference(prior.T_camera_base, T_camera_base[list(prior.stations)]).ravel()
     residual = residual + rows[:, own] @ off
     return np.concatenate([np.delete(rows, all_stations, axis=1), rows[:, own]], axis=1), residual
-
-
-def _by_camera(T_camera_base: Array) -> Array:
-    """Changes (omega, tau) of T_camera_base (4, 4) by a rotation phi and a motion s of the camera
-    along its own axes, (6, 6): points become Exp(-phi) (p - s) in its frame.
-    """
-    out = -np.eye(6)
-    out[3:, :3] = skew(T_camera_base[:3, 3])
-    return out
 
 
 def _across_axes(machine: Machine) -> Array:

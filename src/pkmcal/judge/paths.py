@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, rms
 from pkmcal.judge.prediction import Prediction
 from pkmcal.mechanisms import Machine
 from pkmcal.session.load import SHORTEST_PATH, Session
@@ -42,7 +42,7 @@ def straightness(points: Array) -> Straightness:
     centred = points - points.mean(axis=0)
     along = np.linalg.svd(centred)[2][0]
     off = np.linalg.norm(centred - np.outer(centred @ along, along), axis=1)
-    return Straightness(float(np.sqrt(np.mean(off**2))), float(off.max()))
+    return Straightness(rms(off), float(off.max()))
 
 
 def paths_of(session: Session) -> dict[str, list[int]]:

@@ -125,7 +125,12 @@ def validate_calibration(
         # New configurations, measured and estimated with the machine free.
         lines, calibrated = paths_of(session), calibrated_rows(saved, session)
         if not regions:
-            check_new(calibrated, _has_image(session), *NOT_INDEPENDENT)
+            # configurations with an image; all of a tracker's, or of readings alone
+            every = bool(session.trackers or not session.stations)
+            observed = np.full(len(session.configurations), every)
+            for station in session.stations:
+                observed[[photo.configuration for photo in station.images]] = True
+            check_new(calibrated, observed, *NOT_INDEPENDENT)
         remeasured = measured_new_data(saved, session, seed, part(progress, 0, 0.8))
         session = replace(remeasured.session, machine=session.machine)
         estimate = remeasured.estimate
@@ -180,13 +185,3 @@ def nominal_of(saved: SavedCalibration) -> Machine:
     """
     table = replace(saved.machine.parameters, nominal=saved.nominal.copy())
     return replace(saved.machine, parameters=table, values=saved.nominal.copy())
-
-
-def _has_image(session: Session) -> Booleans:
-    """Mask (K,) of configurations with an image; all if there is a tracker, or for readings without
-    stations.
-    """
-    out = np.full(len(session.configurations), bool(session.trackers or not session.stations))
-    for station in session.stations:
-        out[[photo.configuration for photo in station.images]] = True
-    return out

@@ -155,7 +155,11 @@ def watch_machine(
         old = saved.document.get("statistics") or {}
         factors = ("noise_scale", "pose_scale", "link_scale")
         before = RowGroups(*(float(old.get(name, 1.0)) for name in factors))
-        data_weights = Trust.of(remeasured.estimate, before, _reading_scale(saved, session))
+        # the noise of readings as the calibration scaled it, if the session states the same
+        joints = (saved.document.get("session") or {}).get("joints") or {}
+        same = joints.get("noise") == session.joint_noise
+        reading_scale = float(old.get("reading_scale", 1.0)) if same else 1.0
+        data_weights = Trust.of(remeasured.estimate, before, reading_scale)
         noise = remeasured.estimate.statistics.noise_scale * data_weights.scale.edges
         held = _hold_new(saved, session, remeasured, data_weights, ~calibrated)
         prior = saved.prior(same_place, session.station_names)
@@ -187,16 +191,6 @@ def watch_machine(
             stations_moved=stations_moved,
             timings={**remeasured.timings, "all": time.perf_counter() - began},
         )
-
-
-def _reading_scale(saved: SavedCalibration, session: Session) -> float:
-    """Factor on the stated noise of readings that the calibration estimated; 1 if the session
-    states another noise.
-    """
-    joints = (saved.document.get("session") or {}).get("joints") or {}
-    statistics = saved.document.get("statistics") or {}
-    same = joints.get("noise") == session.joint_noise
-    return float(statistics.get("reading_scale", 1.0)) if same else 1.0
 
 
 def names_of(session: Session) -> Names:

@@ -88,10 +88,13 @@ def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
     square = layout.n_equations == layout.motion.shape[1]
     if not square or not layout.rods_alone or layout.n_internal:
         return None
-    base, platform = (_leg_chains(groups, theta) for groups in (layout.base, layout.platform))
-    if base is None or platform is None:
-        return None
     n = layout.n_legs
+    base, platform = (
+        {j: one for j, one in leg_chains(groups, theta).items() if one is not None}
+        for groups in (layout.base, layout.platform)
+    )
+    if len(base) < n or len(platform) < n:  # a carrier without an elementary joint
+        return None
     foot, along, across, ahead, on_body, floating = np.zeros((6, n, 3))
     for j, chain in base.items():
         foot[j] = chain.point + chain.arm
@@ -126,15 +129,14 @@ def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
     )
 
 
-def _leg_chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain] | None:
-    """Elementary joint of each leg; None if any leg has none."""
-    chains: dict[int, Chain] = {}
+def leg_chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain | None]:
+    """Elementary joint of each leg on one side, None for a carrier without one."""
+    chains: dict[int, Chain | None] = {}
     for group in groups:
         chain = group.carrier.chain(group.of(theta))
-        if chain is None:
-            return None
         for k, leg in enumerate(group.legs.tolist()):
-            chains[leg] = Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
+            own = chain and Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
+            chains[leg] = own
     return chains
 
 

@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, rms
 from pkmcal.geometry.rigid import inverse as inverted
 from pkmcal.geometry.rigid import look_at, pose, rotation, rotation_vector
 from pkmcal.identify.gauge import default_gauge
@@ -524,7 +524,7 @@ def ranks(study: StudyResult[H4ByBoard]) -> dict[tuple[H4ModelKind, str], tuple[
 def largest_side(study: StudyResult[H4ByBoard], model_and_method: tuple[str, str]) -> float:
     """Root mean square over runs of the largest of the square's four errors, m."""
     worst: Array = np.abs(study.values("square", "design", *model_and_method)).max(axis=1)
-    return float(np.sqrt(np.mean(worst**2)))
+    return rms(worst)
 
 
 # IV.C and IV.D: validation

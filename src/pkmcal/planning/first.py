@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, numbered
+from pkmcal.arrays import Array, Booleans, Integers, evenly, numbered
 from pkmcal.calibration.camera_refinement import refinement_of
 from pkmcal.errors import ResultError
 from pkmcal.identify.bundle import bundle
@@ -125,7 +125,7 @@ def spread_over(
     """
     most = min(most, -(-most * FIRST_IMAGES_MEASURED // (FIRST_IMAGES_A_STATION * n_stations)))
     first = np.sort(np.unique(configuration, return_index=True)[1])
-    return first[np.unique(np.linspace(0, len(first) - 1, min(most, len(first))).astype(int))]
+    return first[evenly(len(first), most)]
 
 
 def first_edges(

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.arrays import Array, Booleans, Integers, evenly, short_repr
 from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import InputError
 from pkmcal.levels import NEGLIGIBLE
@@ -553,7 +553,7 @@ def _with_stations(
     else:
         wide, poses = rig, tuple(StationPose.of(T) for T in rig.T_station_base)
     # Rows of the same few configurations from each station.
-    few = np.unique(np.linspace(0, len(candidates.joints) - 1, options.for_stations).astype(int))
+    few = evenly(len(candidates.joints), options.for_stations)
     part = Configurations(*(x[few] for x in candidates))
     machine_prior = subject.prior and subject.prior.only(())
     infos = [

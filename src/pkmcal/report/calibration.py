@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, rms
 from pkmcal.calibration import toolmap
 from pkmcal.calibration.archive import keep_earlier
 from pkmcal.calibration.file_names import CALIBRATION_REPORT_FILE
@@ -416,7 +416,7 @@ def _flatness(bed: Bed, tool: ToolAccuracy) -> Figure:
         f"1σ of the tool's height over a disc of {brief(bed.radius * 1e3)} mm radius, the bed's"
         " own tilt and height aside; by the nominal model's tolerances"
         f" {brief(bed.by_drawing * 1e3)} mm. The nominal model bent it by"
-        f" {brief(float(np.sqrt(np.mean(bent**2))) * 1e3)} mm where it was probed. Along x and y"
+        f" {brief(rms(bent) * 1e3)} mm where it was probed. Along x and y"
         f" {brief(bed.sideways * 1e3)} mm, by the nominal model",
     )
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, enlargement
+from pkmcal.arrays import Array, Booleans, Integers, enlargement, evenly
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
@@ -179,7 +179,7 @@ def upright_turn(quarter_turns: int) -> Array:
 
 def mean_image(images: Sequence[Integers]) -> Integers | None:
     """Mean of a few images, spread over all of them; None if none can be read."""
-    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), MEAN_IMAGES)).astype(int))
+    chosen = evenly(len(images), MEAN_IMAGES)
     sizes = list[Array]()
     for k in chosen.tolist():
         try:

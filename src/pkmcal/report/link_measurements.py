@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, rms
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import DISPLAY_UNITS, measurement_kinds
@@ -36,10 +36,10 @@ def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> 
         inliers = weight >= INLIER_WEIGHT
         n_rejected = "" if inliers.all() else f", {int(np.sum(~inliers))} rejected"
         joined = count(len(np.unique(links.configuration)), "configuration")
-        times = number(_rms(off[inliers] / links.sigma[inliers]), 2)
+        times = number(rms(off[inliers] / links.sigma[inliers]), 2)
         text = (
             f"{count(len(links), kind.one)} between {joined}{n_rejected}. They are"
-            f" {brief(_rms(off[inliers]) * factor)} {unit} off the calibrated machine (root mean"
+            f" {brief(rms(off[inliers]) * factor)} {unit} off the calibrated machine (root mean"
             f" square), which is {times} times their stated noise."
         )
         out.append(
@@ -62,11 +62,6 @@ def weights(every: Sequence[LinkSet], estimate: Estimate) -> list[tuple[str, Arr
         out.append((one, estimate.link_weights[first : first + len(links)]))
         first += len(links)
     return out
-
-
-def _rms(values: Array) -> float:
-    """Root mean square; NaN of an empty array."""
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
 def _table(

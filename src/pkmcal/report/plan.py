@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,18 +15,35 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms.drives import ball_of, legs_space
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome.blocks.base import configuration_key
+from pkmcal.outcome.blocks.plot import (
+    DotsMark,
+    LineMark,
+    Plot,
+    Point,
+    RuleMark,
+    line_points,
+    log_axis,
+    rounded,
+)
+from pkmcal.outcome.blocks.space import Space, SpacePoints
+from pkmcal.outcome.blocks.text import Hint
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.placement.stations import StationPose
-from pkmcal.planning.plan import Accuracy, MeasurementPlan
+from pkmcal.planning.plan import Accuracy, MeasurementPlan, TriedStation
 from pkmcal.planning.rig import BoardFrom, LegsFrom
-from pkmcal.report.plan_curve import curve_plot
-from pkmcal.report.plan_stage import stage_part
+from pkmcal.report.space import space_points, space_poses
+from pkmcal.web.motion import Postures
+from pkmcal.web.stage import leg_rows, machine_shape
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, number
 
 PLAN_TABLE_FILE, PLAN_STATIONS_FILE = "plan.csv", "stations.yaml"
 PLAN_FORMAT = 1
 PLAN_READING_DECIMALS = 6
 """Decimals of a reading in metres or radians."""
+STATION_COLOURS = ("--calibrated", "--drawing", "--good", "--warn", "--ink", "--accent")
+SMALLEST_CANDIDATE = 0.5
+"""Size of the point of the worst candidate, relative to the best."""
 HANDHELD_PLACES_TEXT = (
     "From: directions of the two images from the middle of the machine, from its x towards its y"
     " axis and above the level, and the distance; to ten degrees is enough. "
@@ -46,7 +64,7 @@ PLAN_METHOD_TEXT = (
 def outcome_of(plan: MeasurementPlan) -> Outcome:
     """Outcome of ``pkmcal plan``."""
     texts: dict[str, str | bytes] = {PLAN_TABLE_FILE: _table_text(plan)}
-    parts = [_curve(plan), stage_part(plan, _cameras(plan)), _order(plan)]
+    parts = [_curve(plan), _stage_part(plan, _cameras(plan)), _order(plan)]
     if plan.tried:
         texts[PLAN_STATIONS_FILE] = yaml_text(stations_document(plan))
         parts.insert(2, _camera_poses(plan))
@@ -219,7 +237,109 @@ def _curve(plan: MeasurementPlan) -> Part:
         "Standard deviations of the tool, mean over the workspace. Fewer: those of the lowest"
         " ranks. More: these again, as often.",
     )
-    return Part("curve", "How many", blocks=(curve_plot(plan),), tables=(table,))
+    return Part("curve", "How many", blocks=(_curve_plot(plan),), tables=(table,))
+
+
+def _curve_plot(plan: MeasurementPlan) -> Plot:
+    """Standard deviation of the best configurations, and of as many by chance."""
+    here = plan.promised
+    x = [float(accuracy.count) for accuracy in plan.curve]
+    y = [accuracy.position * 1e3 for accuracy in plan.curve]
+    chance = plan.by_chance.position * 1e3
+    configurations = "configurations" + ("" if plan.subject.handheld else " from each place")
+    best = tuple(
+        Point(x=n, y=rounded(sigma), tip=f"{n:g} {configurations}: {brief(sigma)} mm")
+        for n, sigma in zip(x, y, strict=True)
+    )
+    by_chance = Point(
+        x=float(here.count), y=rounded(chance), tip=f"{here.count:g} by chance: {brief(chance)} mm"
+    )
+    return Plot(
+        name="curve",
+        title="How σ falls with the number of configurations",
+        caption="Mean over the workspace, both axes logarithmic: by chance alone, four times as"
+        " many halve it. Up to this plan's number the best of the plan; beyond it, each again.",
+        alt="The tool's standard deviation against the number of"
+        f" {configurations}, from {brief(y[0])} to {brief(y[-1])} mm; the table has the numbers",
+        x=log_axis(configurations, x),
+        y=log_axis("σ of the tool's position, mm", (*y, chance)),
+        marks=(
+            RuleMark(name="this plan", axis="x", at=float(here.count), colour="quiet"),
+            LineMark(name="", colour="calibrated", points=line_points(x, y)),
+            DotsMark(name="the best", colour="calibrated", points=best, radius=3),
+            DotsMark(
+                name="by chance", colour="nominal", points=(by_chance,), symbol="cross", radius=5
+            ),
+        ),
+    )
+
+
+def _stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array]]) -> Part:
+    """Section with the machine at each configuration of the plan, in its order.
+
+    cameras : name of the station, camera, and T_camera_base.
+    """
+    machine = plan.subject.rig.machine
+    postures = Postures(plan.joints, plan.T_base_platform)
+    points = _positions_by_station(plan)
+    if plan.tried:
+        points.append(_candidates(plan.tried))
+    block = Space(
+        title="",
+        caption="The machine at a configuration; points are the platform's positions"
+        + ("." if plan.subject.handheld else ", by the stations that measure them.")
+        + (" The larger a camera's place, the better it is alone." if plan.tried else ""),
+        alt="The machine in three dimensions at the configurations of the plan, with the cameras.",
+        machine=machine_shape(
+            machine,
+            leg_rows(machine, None),
+            {name: (camera, inverse(T)) for name, camera, T in cameras},
+            Postures(*(part[:1] for part in postures)),
+        ),
+        poses=space_poses(machine, postures, plan.names, configuration_key),
+        points=tuple(points),
+    )
+    hint = Hint(text="The slider takes the machine through the configurations in their order.")
+    return Part("where", "In space", blocks=(block, hint))
+
+
+def _positions_by_station(plan: MeasurementPlan) -> list[SpacePoints]:
+    """Platform positions, one set for each group of stations that measure together."""
+    where = [f"From {listed(names, 3)}" for names in plan.stations]
+    if plan.subject.handheld:  # each has its own
+        where = ["In two images each"] * len(where)
+    out: list[SpacePoints] = []
+    for n, words in enumerate(dict.fromkeys(where)):
+        rows = [k for k, own in enumerate(where) if own == words]
+        names = [plan.names[k] for k in rows]
+        out.append(
+            space_points(
+                words,
+                STATION_COLOURS[n % len(STATION_COLOURS)],
+                plan.T_base_platform[rows, :3, 3],
+                [configuration_key(name) for name in names],
+                [f"{name} ({words[0].lower()}{words[1:]})" for name in names],
+            )
+        )
+    return out
+
+
+def _candidates(tried: tuple[TriedStation, ...]) -> SpacePoints:
+    """Candidate places of the camera, the larger the better alone."""
+    level = np.log([one.alone for one in tried])
+    worse = (level - level.min()) / (np.ptp(level) or 1.0)
+    state = [", chosen" if one.chosen else "" for one in tried]
+    return space_points(
+        "Places tried",
+        "--quiet",
+        np.array([one.place.position for one in tried]),
+        [""] * len(tried),
+        [
+            f"alone {brief(one.alone * 1e3)} mm{text}"
+            for one, text in zip(tried, state, strict=True)
+        ],
+        np.round(1 - (1 - SMALLEST_CANDIDATE) * worse, 2).tolist(),
+    )
 
 
 def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:

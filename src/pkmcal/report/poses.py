@@ -35,12 +35,22 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
     error = errors(poses, estimate)
     more_than_heights = bool(np.any(poses.whiten[..., :5] != 0))
     turns = (one.text for one in turning(session, poses, estimate.state.on_platform))
+    # root mean square residual of each configuration's poses, in standard deviations
+    number = np.bincount(poses.configuration, weights=poses.rows)
+    square = np.bincount(
+        poses.configuration, weights=np.sum(estimate.pose_residuals**2, axis=1)
+    ).tolist()
+    bars = [
+        level_bar(session.configurations[k], float(np.sqrt(square[k] / n)), n)
+        for k, n in enumerate(number.tolist())
+        if n
+    ]
     return Part(
         "poses",
         "Board" if session.board else "Measured poses",
         (f"{' '.join([*_summary(poses, estimate, error), *turns])} {POSE_JUMPS_TEXT}",),
         blocks=panels(
-            _by_configuration(session, poses, estimate),
+            level_plot("poses-by-configuration", "Poses, by configuration", bars),
             _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off"),
             _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned"),
         ),
@@ -129,20 +139,6 @@ def _texts(values: Array, sigma: Array, valid: Booleans, factor: float) -> list[
         text = f"{text} ± {brief(spread * factor)}" if spread else text
         out.append(text if sure else "open")
     return out
-
-
-def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> Plot | None:
-    """Root mean square residual of each configuration's poses, in standard deviations."""
-    number = np.bincount(poses.configuration, weights=poses.rows)
-    square = np.bincount(
-        poses.configuration, weights=np.sum(estimate.pose_residuals**2, axis=1)
-    ).tolist()
-    bars = [
-        level_bar(session.configurations[k], float(np.sqrt(square[k] / n)), n)
-        for k, n in enumerate(number.tolist())
-        if n
-    ]
-    return level_plot("poses-by-configuration", "Poses, by configuration", bars)
 
 
 def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str) -> Plot | None:

@@ -65,9 +65,13 @@ def section(
     poses : plot of the poses' residuals, None without poses.
     """
     sentences = remarks(session, edges, estimate, shifts)
+    boxes = [
+        _edge_box(session, name, edges.station == s, edges, estimate, "quiet", station_key(name))
+        for s, name in enumerate(session.station_names)
+    ]
     plots = panels(
         by_leg(session, edges, estimate),
-        _by_station(session, edges, estimate),
+        _edge_plot("station", boxes),
         _joints(session, estimate),
         poses,
         histogram(estimate.edge_residuals),
@@ -129,15 +133,6 @@ def by_leg(session: Session, edges: EdgeSet, estimate: Estimate) -> Plot | None:
         for j in range(session.machine.n_legs)
     ]
     return _edge_plot("leg", boxes)
-
-
-def _by_station(session: Session, edges: EdgeSet, estimate: Estimate) -> Plot | None:
-    """Box plots of the edges' residuals by station."""
-    boxes = [
-        _edge_box(session, name, edges.station == s, edges, estimate, "quiet", station_key(name))
-        for s, name in enumerate(session.station_names)
-    ]
-    return _edge_plot("station", boxes)
 
 
 def _edge_box(

@@ -13,7 +13,7 @@ from typing import Any, final
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.boards.board import Board, board_from_document
 from pkmcal.boards.prints import Print
 from pkmcal.cameras import Camera
@@ -205,7 +205,7 @@ def place_board(
     if on == "platform":
         places = _brackets(board, discs, rng)
     # machine and board's body at a few configurations
-    few = np.unique(np.linspace(0, len(joints) - 1, BOARD_TRIAL_CONFIGURATIONS).astype(int))
+    few = evenly(len(joints), BOARD_TRIAL_CONFIGURATIONS)
     carried = (
         T_base_platform[few] if on == "platform" else np.broadcast_to(np.eye(4), (few.size, 4, 4))
     )

@@ -193,6 +193,7 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
     # Visibility of board and legs at each station.
     board = T_platform_board = None
     visible = np.ones((design.stations, len(joints)), dtype=bool)
+    corner_visible = np.zeros((*visible.shape, 0), dtype=bool)
     if by_board:
         whole = with_forearms(machine)
         board = design.board or board_for(whole, "platform")
@@ -214,11 +215,8 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
     edges = EdgeSet.empty()
     if "legs" in design.observe:
         edges = _edges(machine, cameras, T_camera_base, poses, joints, pairs)
-    views, corners = np.zeros((0, 2), dtype=int), np.zeros((0, 0), dtype=bool)
-    if board is not None and T_platform_board is not None:
-        views = pairs
-        corner_visible = _corners(board, T_platform_board, cameras, T_camera_base, poses)
-        corners = corner_visible[views[:, 0], views[:, 1]]
+    views = pairs if by_board else np.zeros((0, 2), dtype=int)
+    corners = corner_visible[views[:, 0], rows[views[:, 1]]]
     return Capture(
         machine, cameras, T_camera_base, poses, joints, edges, views, corners, board,
         T_platform_board,

@@ -8,17 +8,13 @@ number of workers. A study with more runs reuses the finished batches.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import zipfile
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
 from importlib.metadata import version
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +24,15 @@ from pkmcal.arrays import Array
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
-from pkmcal.files import alone_in, check_regular, json_text, json_value, write_bytes, write_text
+from pkmcal.files import (
+    alone_in,
+    check_regular,
+    digest_of,
+    json_text,
+    json_value,
+    write_bytes,
+    write_text,
+)
 from pkmcal.mechanisms import Machine
 from pkmcal.studies.tasks import Batch, Key, Sample, SolvedBatch, StudySetting
 
@@ -56,8 +60,8 @@ class Store:
         """
         folder = out / BATCHES_FOLDER
         path = folder / STUDY_DESCRIPTION_FILE
-        own = {"study": title, "seed": seed, "pkmcal": version("pkmcal"), "code": code_digest()}
-        own |= {"digest": digest([plainly(setting) for setting in settings], seed)}
+        digest = digest_of([plainly(setting) for setting in settings], seed)
+        own = {"study": title, "seed": seed, "pkmcal": version("pkmcal"), "digest": digest}
         with alone_in(folder, "study"):
             if any(folder.glob("*.npz")):
                 before = _description(path)
@@ -115,28 +119,6 @@ class Store:
         return self.folder / f"{cell:03d}-{number:05d}.npz"
 
 
-def digest(settings: Any, seed: int) -> str:
-    """Hash that identifies a study: program version and code, settings and seed, but not the
-    number of runs.
-    """
-    text = json.dumps([version("pkmcal"), code_digest(), settings, seed], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-@cache
-def code_digest() -> str:
-    """Hash of all modules of the program: between releases, code changes but not its version."""
-    out = hashlib.sha256()
-    folders: list[Traversable] = [files("pkmcal")]
-    for folder in folders:
-        for one in sorted(folder.iterdir(), key=lambda one: one.name):
-            if one.is_dir():
-                folders.append(one)
-            elif one.name.endswith(".py"):
-                out.update(one.read_bytes())
-    return out.hexdigest()
-
-
 def plainly(value: Any) -> Any:
     """A setting as plain data, with everything that its numbers depend on."""
     if isinstance(value, Machine):
@@ -169,6 +151,8 @@ def _description(path: Path) -> dict[str, Any]:
 
 
 def _description_text(description: Mapping[str, Any]) -> str:
-    parts = [f"{description.get('study')}", f"seed {description.get('seed')}"]
-    program = f"pkmcal {description.get('pkmcal')} with code {str(description.get('code'))[:8]}"
-    return ", ".join([*parts, program])
+    digest = str(description.get("digest"))[:8]
+    return (
+        f"{description.get('study')}, seed {description.get('seed')},"
+        f" pkmcal {description.get('pkmcal')}, digest {digest}"
+    )

@@ -88,10 +88,16 @@ def edge_search(content: SessionContent, request: ViewRequest) -> EdgesAnswer:
         texts.append(f"The board: {n} detected." if detection.success else reason)
         marks.append("good" if detection.success else Level.WRONG)
     order: tuple[Mark, ...] = ("good", Level.DOUBTFUL, Level.WRONG)
+    # numbers of each leg's edges
+    measured = [one.leg for one in result.measured]
+    predicted = [*measured, *(one.curve.leg for one in result.missing)]
     return EdgesAnswer(
         mark=max((mark for mark in marks if mark is not None), key=order.index, default=None),
         texts=tuple(texts),
-        legs=tuple(_leg_counts(result, pane.machine.n_legs)),
+        legs=tuple(
+            LegCount(leg=leg, measured=measured.count(leg), predicted=predicted.count(leg))
+            for leg in range(1, pane.machine.n_legs + 1)
+        ),
         reasons=tuple(_reasons(result.missing)),
         median=result.median,
         layers=(
@@ -100,16 +106,6 @@ def edge_search(content: SessionContent, request: ViewRequest) -> EdgesAnswer:
             Layer(name="corners", shapes=tuple(Cross(at=at) for at in corners)),
         ),
     )
-
-
-def _leg_counts(result: _LegEdges, n: int) -> list[LegCount]:
-    """Numbers of each leg's edges."""
-    measured = [one.leg for one in result.measured]
-    predicted = [*measured, *(one.curve.leg for one in result.missing)]
-    return [
-        LegCount(leg=leg, measured=measured.count(leg), predicted=predicted.count(leg))
-        for leg in range(1, n + 1)
-    ]
 
 
 def _reasons(missing: list[_MissingEdge]) -> list[str]:

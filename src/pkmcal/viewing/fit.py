@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, evenly
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
 from pkmcal.levels import OUTLIER_SIGMAS
@@ -186,7 +186,7 @@ def _search_view(content: SessionContent, s: int) -> StationView:
     if s not in views:
         session, station = content.session, content.station(s)
         rows = np.array([photo.configuration for photo in station.images])
-        few = np.unique(np.linspace(0, len(rows) - 1, min(FIT_IMAGES, len(rows))).astype(int))
+        few = evenly(len(rows), FIT_IMAGES)
         tables = distance_tables([content.image(s, int(k)) for k in few])
         views[s] = StationView(
             session.machine,

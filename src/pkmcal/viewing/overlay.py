@@ -11,7 +11,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import apply
+from pkmcal.geometry.rigid import apply, is_rigid
 from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
     EdgeCurve,
@@ -83,9 +83,7 @@ def requested_pose(request: ViewRequest) -> Array | None:
     if request.pose is None:
         return None
     pose = np.array(request.pose, dtype=float)
-    rot = pose[:3, :3]
-    rigid = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
-    if not rigid or not np.array_equal(pose[3], [0, 0, 0, 1]):
+    if not is_rigid(pose):
         raise InputError("the pose is no rotation and translation", where="the page, pose")
     return pose
 

@@ -12,6 +12,7 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.files import Schema
+from pkmcal.geometry.rigid import is_rigid
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.blocks.base import Pose
 from pkmcal.outcome.blocks.machine import Configuration
@@ -41,7 +42,6 @@ def machine_document(
     origin: str,
     sigma: Array | None = None,
     cameras: Mapping[str, tuple[Camera, Array]] | None = None,
-    notes: tuple[str, ...] = (),
     sweeps: bool = True,
 ) -> shapes.MachineDocument:
     """Document of a machine with sliders for its readings.
@@ -54,7 +54,6 @@ def machine_document(
     """
     shape = machine_shape(machine, leg_rows(machine, sigma), cameras or {})
     redundant = machine.redundancy > 0
-    notes += _notes(machine, shape, redundant)
     return shapes.MachineDocument(
         program=f"pkmcal {version('pkmcal')}",
         title=machine.name,
@@ -62,7 +61,7 @@ def machine_document(
         f" {count(machine.n_joints, 'reading')},"
         f" {count(machine.n_joints - machine.redundancy, 'degree')} of freedom"
         f" ({MOTION_TEXTS[machine.document.motion]}).",
-        notes=notes,
+        notes=_notes(machine, shape, redundant),
         machine=shape,
         sweeps=_sweeps(machine) if sweeps else None,
         redundant=redundant,
@@ -135,8 +134,7 @@ def configuration_at(machine: Machine, request: PoseRequest) -> PoseAnswer:
             expected=str(machine.n_joints),
         )
     posture = Postures(np.array([request.readings]), np.array([request.T_base_platform]))
-    rotation = posture.T_base_platform[0, :3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+    if not is_rigid(posture.T_base_platform[0]):
         raise InputError("the pose is no rotation and translation", where="the page, pose")
     low, high = slider_ranges(machine, home_posture(machine).readings[0])[request.index]
     if not low <= request.value <= high:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import Document, Schema, next_step_after, validated_document
+from pkmcal.files import Document, Schema, refused_by_system, validated_document
 from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.guard import Guard
 from pkmcal.web.page import served_page
@@ -124,13 +124,7 @@ async def response_of(work: Callable[[], Response | Schema]) -> Response:
     except PkmcalError as error:
         return JSONResponse(error.as_dict(), 422)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        message = InputError(
-            f"the operating system refused: {reason}",
-            where=error.filename,
-            next_step=next_step_after(error),
-        )
-        return JSONResponse(message.as_dict(), 422)
+        return JSONResponse(refused_by_system(error).as_dict(), 422)
     except Exception as error:  # noqa: BLE001 - the last resort, as at the command line
         message = PkmcalError(
             f"this is a defect of pkmcal, not of your session: {type(error).__name__}: {error}",

@@ -22,7 +22,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import Chain, base_carriers
 from pkmcal.mechanisms.closure import base_ends, scales
 from pkmcal.mechanisms.document import ActuatedLength
-from pkmcal.mechanisms.layout import CarrierGroup
+from pkmcal.mechanisms.follower import leg_chains
 from pkmcal.mechanisms.motors import bodies
 from pkmcal.outcome.blocks import machine as shapes
 from pkmcal.outcome.blocks.base import Line, PoseRow, Vector
@@ -81,7 +81,7 @@ def leg_lines(machine: Machine, postures: Postures) -> list[LegLines]:
     """Lines of all legs at n postures."""
     readings, poses = postures
     b = np.broadcast_to(machine.ends_at(readings, poses).b, (len(poses), machine.n_legs, 3))
-    chains = dict(_chains(machine, machine.layout.platform))
+    chains = leg_chains(machine.layout.platform, machine.values)
     out: list[LegLines] = []
     for j, arm in enumerate(machine.arms_at(readings)):
         base, platform = np.broadcast_to(arm, (len(poses), *arm.shape[-2:])), b[:, j, None]
@@ -283,17 +283,6 @@ def _paths(machine: Machine, ranges: Array) -> list[Array]:
     ]
 
 
-def _chains(
-    machine: Machine, groups: tuple[CarrierGroup, ...]
-) -> Iterator[tuple[int, Chain | None]]:
-    """Elementary joint of each leg on one side, None for a carrier without one."""
-    for group in groups:
-        chain: Chain | None = group.carrier.chain(group.of(machine.values))
-        for k, j in enumerate(group.legs.tolist()):
-            own = chain and Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
-            yield j, own
-
-
 def _feet(home: shapes.Configuration, paths: list[Array]) -> Array:
     """Where each leg stands on the base, (L, 3): the motor of an arm, the lower end of a guide, or
     the joint.
@@ -307,7 +296,10 @@ def _feet(home: shapes.Configuration, paths: list[Array]) -> Array:
 
 def _platform_points(machine: Machine) -> Array:
     """Joints of the rigid part of the platform, (L, 3), platform frame: a bar's is its hinge."""
-    centres, chains = machine.platform_centers(), dict(_chains(machine, machine.layout.platform))
+    centres, chains = (
+        machine.platform_centers(),
+        leg_chains(machine.layout.platform, machine.values),
+    )
     return np.array(
         [
             centre if (chain := chains[j]) is None or chain.motion == "fixed" else chain.point
@@ -337,7 +329,7 @@ def _axes(machine: Machine) -> Iterator[shapes.JointAxis]:
         ("platform", machine.layout.platform, machine.platform_axes(), machine.platform_centers()),
     )
     for side, groups, parameters, centres in sides:
-        for j, chain in sorted(_chains(machine, groups)):
+        for j, chain in sorted(leg_chains(groups, machine.values).items()):
             node = getattr(machine.document.legs[j], side)
             turns = chain is not None and chain.motion == "turn"
             stated = getattr(node, "axis", None) if chain and chain.motion == "fixed" else None
@@ -364,7 +356,7 @@ def _axes(machine: Machine) -> Iterator[shapes.JointAxis]:
 def _readings(machine: Machine, ranges: Array) -> tuple[shapes.Reading, ...]:
     """Readings with their ranges and the sense of their signs."""
     layout, out = machine.layout, list[shapes.Reading]()
-    chains = dict(_chains(machine, layout.base))
+    chains = leg_chains(layout.base, machine.values)
     for k, (name, unit) in enumerate(zip(machine.joint_names, machine.joint_units, strict=True)):
         legs = np.flatnonzero(layout.actuated == k).tolist()
         direction, zero = _sense(machine, legs[0], chains[legs[0]])

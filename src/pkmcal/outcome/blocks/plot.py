@@ -113,13 +113,13 @@ def _ends(values: Iterable[float], more: tuple[float, ...] = ()) -> tuple[float,
     return (min(finite), max(finite)) if finite else (0.0, 1.0)
 
 
-def linear_ticks(low: float, high: float, least: int = LEAST_TICKS) -> tuple[Tick, ...]:
-    """Labels at the multiples of the largest round step of which ``least`` lie on the axis."""
+def linear_ticks(low: float, high: float) -> tuple[Tick, ...]:
+    """Labels at the multiples of the largest round step of which LEAST_TICKS lie on the axis."""
     power = math.floor(math.log10(high - low))
     for decade, factor in product((power, power - 1, power - 2), (5, 2, 1)):
         step = factor * 10.0**decade
         ticks = range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
-        if len(ticks) >= least:
+        if len(ticks) >= LEAST_TICKS:
             places = max(0, -decade)
             return tuple(Tick(at=k * step, label=number(k * step, places)) for k in ticks)
     raise ValueError(f"no ticks between {low} and {high}")
