@@ -142,6 +142,21 @@ def test_cards_are_marked_by_the_verdict(case, finding, question):
     assert cards[DATA_QUESTION]["limit"].endswith(f"{100 * VERDICT.too_many_rejected:.0f} %")
 
 
+@pytest.mark.parametrize(
+    ("usable", "options", "tone"),
+    [
+        (True, {}, "good"),
+        (True, {"partial": True}, "partial"),
+        (False, {"level": Level.DOUBTFUL}, "partial"),
+        (False, {}, "bad"),
+        (False, {"neutral": True}, "neutral"),
+    ],
+)
+def test_the_tone_of_a_page_is_that_of_its_sign(usable, options, tone):
+    outcome = Outcome("check", "Check", Verdict(usable, "Done."), **options)
+    assert report_document(outcome).verdict.tone == tone
+
+
 def test_sections_of_a_refused_result_are_void(case):
     refused = case_document(*vars(case).values(), Verdict(False, "No."))
     void = {section["name"] for section in refused["sections"] if section["void"]}

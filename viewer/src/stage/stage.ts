@@ -21,7 +21,7 @@ import { type Label, Labels } from "./labels";
 import { Palette } from "./palette";
 
 const FIELD = 26; // vertical field of view, degrees
-const PAPER = ["680px", "290px"]; // within the margins of A4, at 96 px an inch
+const PAPER = ["680px", "258px"]; // within the margins of A4, at 96 px an inch
 const MARGIN = 0.88; // share of the picture for what is fitted
 const KEY_TURN = Math.PI / 36;
 const KEY_ZOOM = 1.15;
