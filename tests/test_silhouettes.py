@@ -321,7 +321,7 @@ def test_machines_as_likely_have_their_edges_near(calibration):
 
 def test_a_machine_that_does_not_settle_is_refused(tripod_calibration):
     """Change of the machine by the last measurement pass, in its standard deviations."""
-    results = turns_of(tripod_calibration, 0.0, ())
+    results = turns_of(tripod_calibration, None, 0.0, ())
     assert list(results._replace(change=0.9 * REFINEMENT.settled_change).reasons) == []
     (reason,) = results._replace(change=2.5).reasons
     assert reason.code == "estimate.unsettled"
