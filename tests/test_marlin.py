@@ -17,7 +17,7 @@ from export_sources import source_of
 from faults import raises
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
-from pkmcal.exporters.delta import read_firmware_from_base
+from pkmcal.exporters.delta_texts import read_firmware_from_base
 from pkmcal.firmware.contract import read_printer
 from pkmcal.firmware.probed import read_measured
 from pkmcal.firmware.session import heights_texts, nominal_text, write_printer_session

@@ -36,14 +36,16 @@ from pkmcal.exporters.contract import Difference, Exporter, commented, exact, la
 from pkmcal.exporters.delta import (
     DEGREES_A_RADIAN,
     MM_A_METRE,
-    UNTOLD_SCALE_DIFFERENCE,
     UNWARNED_TOOL_ERROR,
     Fit,
     Freedoms,
+    fit_of,
+)
+from pkmcal.exporters.delta_texts import (
+    UNTOLD_SCALE_DIFFERENCE,
     about,
     firmware_length,
     firmware_tool_difference,
-    fit_of,
     scales_of,
 )
 from pkmcal.exporters.limbs import Limbs, rod_limbs

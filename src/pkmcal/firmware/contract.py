@@ -27,18 +27,15 @@ from pkmcal.exporters.contract import (
     exporters,
     largest,
 )
-from pkmcal.exporters.delta import (
+from pkmcal.exporters.delta import Fit, Freedoms, fit_of, value_sigmas
+from pkmcal.exporters.delta_texts import (
     STEPS_ROUNDING,
     SWITCH_ROUNDING,
-    Fit,
-    Freedoms,
     Inverse,
     corrected_steps,
     firmware_tool_difference,
-    fit_of,
     readings_elsewhere,
     switch_values,
-    value_sigmas,
     workspace_radius,
 )
 from pkmcal.files import closest, quoted, read_text

@@ -26,11 +26,9 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
-from pkmcal.exporters.delta import (
-    DEGREES_A_RADIAN,
+from pkmcal.exporters.delta import DEGREES_A_RADIAN, Fit, Freedoms
+from pkmcal.exporters.delta_texts import (
     SWITCH_ROUNDING,
-    Fit,
-    Freedoms,
     about,
     end_switches,
     firmware_angle,

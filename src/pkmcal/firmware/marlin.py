@@ -34,8 +34,8 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import Difference, ExportedValue, commented, largest
-from pkmcal.exporters.delta import (
-    Fit,
+from pkmcal.exporters.delta import Fit
+from pkmcal.exporters.delta_texts import (
     about,
     firmware_angle,
     firmware_length,

@@ -27,7 +27,8 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
-from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length
+from pkmcal.exporters.delta import Fit
+from pkmcal.exporters.delta_texts import about, firmware_angle, firmware_length
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     TOWER_ANGLES,

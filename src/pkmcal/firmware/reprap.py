@@ -26,11 +26,8 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
-from pkmcal.exporters.delta import (
-    DEGREES_A_RADIAN,
-    MM_A_METRE,
-    Fit,
-    Freedoms,
+from pkmcal.exporters.delta import DEGREES_A_RADIAN, MM_A_METRE, Fit, Freedoms
+from pkmcal.exporters.delta_texts import (
     about,
     end_switches,
     firmware_angle,

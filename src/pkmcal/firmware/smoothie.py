@@ -28,7 +28,13 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
-from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length, steps_correction
+from pkmcal.exporters.delta import Fit
+from pkmcal.exporters.delta_texts import (
+    about,
+    firmware_angle,
+    firmware_length,
+    steps_correction,
+)
 from pkmcal.firmware.contract import (
     TOWER_ANGLES,
     Firmware,

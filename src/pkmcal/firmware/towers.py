@@ -20,10 +20,9 @@ import numpy as np
 from pkmcal.arrays import Array, short_repr
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import Difference, ExportedValue, largest
-from pkmcal.exporters.delta import (
-    DEGREES_A_RADIAN,
+from pkmcal.exporters.delta import DEGREES_A_RADIAN, Fit
+from pkmcal.exporters.delta_texts import (
     SWITCH_ROUNDING,
-    Fit,
     end_switches,
     firmware_length,
     proportional_switches,
