@@ -224,7 +224,7 @@ def _value(name: str, varied: Varied, unit: str, text: str) -> Value:
     if varied.words:
         if text in varied.words or (name == "camera" and Path(text).is_file()):
             return text
-        expected = listed(varied.words) + (" or a camera's file" if name == "camera" else "")
+        expected = " or ".join(varied.words) + (" or a camera's file" if name == "camera" else "")
         raise InputError(f"no such {name}", where="--vary", found=text, expected=expected)
     value = math.nan
     with suppress(ValueError):
