@@ -112,10 +112,9 @@ def test_other_things_in_the_place_of_a_session(session, tmp_path):
     assert fault("calibrate", image) == ("session.missing", "a file", 2)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "calibration.json").write_text("{}")
-    for command in ("calibrate", "plan"):
-        assert fault(command, tmp_path / "out") == ("session.missing", "a calibration", 2)
-    for command in ("validate", "watch"):  # the two the other way round
-        assert fault(command, session, tmp_path / "out")[0] == "calibration.missing"
+    # validate and watch with the two the other way round
+    for words in (["calibrate"], ["plan"], ["validate", session], ["watch", session]):
+        assert fault(*words, tmp_path / "out") == ("session.missing", "a calibration", 2)
 
 
 @pytest.mark.parametrize(
