@@ -101,6 +101,43 @@ def test_an_unknown_key(session):
     refused(session, "session.yaml, line ", "obsserve", "observe")
 
 
+def fault(*words):
+    """Code, value found and exit code of a command's only error."""
+    done = run(*words, "--json")
+    return done.json["code"], done.json["found"], done.code
+
+
+def test_other_things_in_the_place_of_a_session(session, tmp_path):
+    (image,) = images(session, "station1")[:1]
+    assert fault("calibrate", image) == ("session.missing", "a file", 2)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "calibration.json").write_text("{}")
+    # validate and watch with the two the other way round
+    for words in (["calibrate"], ["plan"], ["validate", session], ["watch", session]):
+        assert fault(*words, tmp_path / "out") == ("session.missing", "a calibration", 2)
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [(b"PK\x03\x04\x80", "a spreadsheet"), (b"\x89PNG\r\n", "an image"),
+     (b"\xff\xd8\xff\xe0", "an image"), (b"\xff\xfea\0", "byte 0xff")],
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["session.yaml", "joints.csv"])
+def test_a_file_that_is_not_text_is_called_what_it_is(session, name, content, found):
+    (session / name).write_bytes(content)
+    assert fault("calibrate", session) == ("file.not_text", found, 2)
+    if found == "an image":
+        assert fault("plan", "3-rpr", "--camera", session / name)[1] == found
+
+
+def test_the_page_of_a_calibration_in_the_place_of_its_folder(tmp_path):
+    for name in ("report.html", "calibration.json"):
+        (tmp_path / name).write_text("x")
+    done = run("export", tmp_path / "report.html", "--to", "c", "--json")
+    assert (done.code, done.json["code"]) == (2, "machine.not_a_file")
+    assert str(tmp_path) in done.json["next_step"]
+
+
 # readings
 
 

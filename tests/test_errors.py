@@ -28,6 +28,10 @@ def test_only_what_makes_one_sentence():
     assert str(InputError("the file is empty.")) == "the file is empty."
 
 
+def test_an_empty_value_is_called_nothing():
+    assert InputError("this cannot be", found="").found == "nothing"
+
+
 def test_a_found_zero_is_shown():
     assert str(InputError("too few", found=0, expected=2)) == "too few; found 0, expected 2."
 

@@ -77,9 +77,9 @@ def test_a_grid_has_every_combination():
         (["stations=1", "stations=2"], {"code": "study.name_twice", "found": "stations"}),
         (
             ["camera=telescope"],
-            {"found": "telescope", "expected": "pinhole and mirror or a camera's file"},
+            {"found": "telescope", "expected": "pinhole, mirror or a camera's file"},
         ),
-        (["observe=arms"], {"found": "arms", "expected": "legs, board and legs+board"}),
+        (["observe=arms"], {"found": "arms", "expected": "legs, board or legs+board"}),
     ],
 )
 def test_what_cannot_be_varied_is_reported(words, facts):

@@ -87,8 +87,8 @@ def case(verb: str, work: Path) -> Case:
             (work / "mine",), lambda: pkmcal.board(work / "mine"), progress=False
         ),
         "plan": lambda: Case(
-            ("3-rpr", "-n", 4),
-            lambda **more: pkmcal.plan("3-rpr", count=4, **more),
+            ("3-rpr", "-n", 2),
+            lambda **more: pkmcal.plan("3-rpr", count=2, **more),
         ),
         "study": lambda: Case(
             ("a", "--runs", 2), lambda **more: pkmcal.study("a", runs=2, **more)
@@ -143,7 +143,7 @@ class Both:
 
 
 @pytest.fixture(scope="module", params=VERBS)
-def both(request, work, quick_plans) -> Both:
+def both(request, work) -> Both:
     verb, folder = request.param, work / "out" / request.param
     progress: list[tuple[str, float]] = []
     one = case(verb, work)

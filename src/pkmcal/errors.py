@@ -62,7 +62,8 @@ class PkmcalError(Exception):
         self.rivals = rivals
         self.what = _brief(what)
         self.where = None if where is None else _brief(where)
-        self.found = None if found is None else _brief(str(found), LONGEST_VALUE_QUOTED)
+        written = _brief(str(found), LONGEST_VALUE_QUOTED) or "nothing"
+        self.found = None if found is None else written
         self.expected = None if expected is None else _brief(str(expected))
         self.next_step = None if next_step is None else _brief(next_step)
         super().__init__(self.what)

@@ -74,6 +74,7 @@ class MachineView:
             raise InputError(
                 "the file exists and is not a page of the viewer, so it was not replaced",
                 where=str(path),
+                found="a folder" if path.is_dir() else None,
                 next_step="Name another file with -o",
                 code="output.foreign_files",
             )

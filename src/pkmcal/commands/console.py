@@ -37,7 +37,7 @@ SMALLEST_SHARE_FOR_ESTIMATE, SHORTEST_TIME_FOR_ESTIMATE = 0.05, 2.0
 
 def parsed_size(text: str) -> tuple[int, int]:
     """(width, height) from a text such as 800x600."""
-    match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text.strip())
+    match = re.fullmatch(r"(\d{1,6})\s*[xX×]\s*(\d{1,6})(?:\s*px)?", text.strip())
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(size) < SMALLEST_PICTURE_SIDE or max(size) > LARGEST_PICTURE_SIDE:
         raise InputError(

@@ -232,7 +232,7 @@ def parsed_number(text: str, allowed: Range, where: str) -> float | str:
                 allowed.check(value, where)
                 return text if " or " in allowed.unit else value
     raise InputError(
-        "this number cannot be used", where=where, found=text.strip() or "nothing",
+        "this number cannot be used", where=where, found=text.strip(),
         expected=expected,
     )  # fmt: skip
 

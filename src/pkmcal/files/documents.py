@@ -29,6 +29,13 @@ from pkmcal.files.recordings import RECORDING_HEAD_BYTES, recording_error
 from pkmcal.files.regular import check_regular
 from pkmcal.files.replacing import check_replaced
 
+BINARY_KINDS = {
+    b"PK\x03\x04": "a spreadsheet",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet",
+    b"\x89PNG": "an image",
+    b"\xff\xd8\xff": "an image",
+}
+"""Kinds of files, by their first bytes, that are named by mistake for a text file."""
 LONGEST_QUOTE = 60
 """Characters of a value that a message quotes: enough to recognise it, on one line."""
 SHORTEST_PART = 4
@@ -108,6 +115,17 @@ def _decoded(raw: bytes, label: str, before: int) -> str:
         text = raw.decode("utf-8")
     except UnicodeDecodeError as error:
         line = before + raw.count(b"\n", 0, error.start) + 1
+        for beginning, kind in BINARY_KINDS.items():
+            if before == 0 and raw.startswith(beginning):
+                spreadsheet = kind == "a spreadsheet"
+                raise InputError(
+                    "the file is not text",
+                    where=label,
+                    found=kind,
+                    expected="a text file",
+                    next_step="Save it as CSV (comma delimited)" if spreadsheet else None,
+                    code="file.not_text",
+                ) from None
         raise InputError(
             "the file is not UTF-8 text",
             where=f"{label}, line {line}",

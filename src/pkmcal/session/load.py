@@ -69,7 +69,7 @@ from pkmcal.session.schema import (
 )
 from pkmcal.wording import count, listed
 
-SESSION_FILE_NAME = "session.yaml"
+SESSION_FILE_NAME, CALIBRATION_FILE_NAME = "session.yaml", "calibration.json"
 SESSION_FILE_VERSION = 1
 SHORTEST_PATH = 3
 """Fewest configurations of a straight path; two points are always on a line."""
@@ -491,16 +491,23 @@ def _session_document(folder: Path) -> tuple[Path, Document]:
         raise InputError(
             "there is no such session folder",
             where=str(folder),
+            found="a file" if folder.is_file() else None,
+            expected="a folder with a session.yaml" if folder.is_file() else None,
             next_step=f"There is {folder.with_name(beside)}" if beside else None,
             code="session.missing",
         )
     if not (folder / SESSION_FILE_NAME).exists():
         below = sorted(path.parent.name for path in folder.glob(f"*/{SESSION_FILE_NAME}"))
+        found = f"sessions in {listed(below)} below it" if below else None
+        step = "Name the session's folder; pkmcal new DIR makes one to fill in"
+        if (folder / CALIBRATION_FILE_NAME).is_file():
+            found = "a calibration"
+            step = "Name the session; validate and watch take the calibration first"
         raise InputError(
             f"the folder holds no {SESSION_FILE_NAME}",
             where=str(folder),
-            found=f"sessions in {listed(below)} below it" if below else None,
-            next_step="Name the session's folder; pkmcal new DIR makes one to fill in",
+            found=found,
+            next_step=step,
             code="session.missing",
         )
     document = read_yaml(folder / SESSION_FILE_NAME)

@@ -241,8 +241,10 @@ def _value(name: str, varied: Varied, unit: str, text: str) -> Value:
     if varied.words:
         if text in varied.words or (name == "camera" and Path(text).is_file()):
             return text
-        expected = listed(varied.words) + (" or a camera's file" if name == "camera" else "")
-        raise InputError(f"no such {name}", where="--vary", found=text, expected=expected)
+        *words, last = *varied.words, *(["a camera's file"] if name == "camera" else [])
+        raise InputError(
+            f"no such {name}", where="--vary", found=text, expected=f"{', '.join(words)} or {last}"
+        )
     value = math.nan
     with suppress(ValueError):
         value = read_quantity(text, unit)
