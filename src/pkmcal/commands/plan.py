@@ -25,7 +25,7 @@ from pkmcal.ranges import RANGES
 EXAMPLES = """\
 pkmcal plan my-machine
 pkmcal plan gough-stewart -n 20 --places 3
-pkmcal plan delta --tracker "20 um" --joint-noise "0.01 mm"
+pkmcal plan delta --tracker "20 um" --joint-noise "0.001 deg"
 """
 
 
