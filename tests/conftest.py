@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -83,18 +82,6 @@ LONG = (
     "test_legible", "test_writing", "test_response", "test_edge_noise", "test_check_forecast",
     "test_cli_camera", "test_discrepancy", "test_readings_alone", "test_check", "test_python",
 )  # fmt: skip
-
-
-def pytest_collection(session):
-    """Where all tests are collected, every second worker imports their files in the opposite order.
-
-    In a new clone pytest rewrites the assertions of each file first, which takes ten seconds; so
-    each worker reads half of the files as the other one wrote them.
-    """
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    if worker % 2 and session.config.args_source is pytest.Config.ArgsSource.TESTPATHS:
-        for path in sorted(Path(__file__).parent.glob("test_*.py"), reverse=True):
-            import_module(path.stem)
 
 
 def pytest_collection_modifyitems(items):
