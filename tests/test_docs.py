@@ -124,7 +124,7 @@ def quick_workplace(boards, tmp_path_factory) -> Path:  # noqa: F811 - the fixtu
 @pytest.mark.parametrize("name", [n for n in NAMES if blocks(text_of(n), "python runnable")])
 def test_examples_run(name, request, monkeypatch, quick_plans, quick_cameras):
     """Blocks of one page share their names, as a reader who types them in would have it."""
-    quick = name == "docs/api.md"
+    quick = name in ("README.md", "docs/api.md")
     monkeypatch.chdir(request.getfixturevalue("quick_workplace" if quick else "workplace"))
     namespace: dict[str, object] = {}
     for body in blocks(text_of(name), "python runnable"):

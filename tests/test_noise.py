@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 
 from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.camera_refinement import refinement_of
+from pkmcal.calibration.handheld import localize_case
+from pkmcal.calibration.localization import boards_of
+from pkmcal.calibration.refinement import identify_poses
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information
@@ -24,6 +28,8 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements.distances import DistanceSet
 from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.outcome.progress import no_progress
+from pkmcal.session.load import load_session
 from pose_sessions import T_CAMERA_BASE, T_PLATFORM_BOARD, measured, upright
 from test_identify_scene import JOINT_NOISE, exact, make_scene
 from test_pose_sessions import make
@@ -99,12 +105,21 @@ def test_intervals_hold_the_truth_as_often_as_they_state(configurations, true):
     assert coverage(configurations, true, NOISE.contradiction_chance, 400)[0] > 0.985
 
 
+def tracked(folder):
+    """Estimate of a tracker's session, without the tests of hypotheses of a calibration."""
+    session = load_session(folder)
+    case = localize_case(session, [], boards_of(session, []), np.random.default_rng(0))
+    cameras = refinement_of(session, False)
+    places = case.scene.T_camera_base
+    return identify_poses(session, case.boards, places, cameras, no_progress).estimate
+
+
 def test_intervals_of_tracked_poses_hold_the_truth_as_often(tmp_path):
     """Those of readings and of poses, of hexapods that a tracker measured."""
     right = []
     for seed in range(12):
         made = make(tmp_path / str(seed), "gough-stewart", n=16, seed=seed)
-        estimate = calibrate_session(made.folder).estimate
+        estimate = tracked(made.folder)
         start = batch_of(estimate.machine, estimate.problem, estimate.state)
         result = solve_batch(estimate.problem.problem, start, scale_noise=False)
         for kind in (READING_ROWS, POSE_ROWS):

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from conftest import have_cores, run
+from counting import COUNT_KEY, Counting
 from faults import raises
 from pkmcal.api.study import study
 from pkmcal.errors import InputError, ResultError
@@ -28,7 +29,7 @@ from pkmcal.studies.calibrations import (
 from pkmcal.studies.store import Store
 from pkmcal.studies.study_report import runs_csv, study_document
 from pkmcal.studies.sweep import cells_of
-from pkmcal.studies.tasks import Batch, Job, Population, Sample
+from pkmcal.studies.tasks import Job
 from test_study import SMALL, batch_of
 
 COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "150")
@@ -94,33 +95,6 @@ def test_a_study_that_is_stopped_goes_on(tmp_path, how, whole, one_process):
     assert not list(stopped.glob("batches/.*"))
 
 
-class Counting:
-    """A setting whose runs are their own random numbers."""
-
-    doing = "Counting"
-    quantities = {"x": tasks.Quantity("mean")}  # noqa: RUF012 - a test's
-
-    def __init__(self, fails: str = "", takes: float = 0.0, ballast: int = 0) -> None:
-        self.fails, self.takes, self.ballast = fails, takes, bytes(ballast)
-
-    def populations(self, runs):
-        return [Population("numbers", runs, 5)]
-
-    def draw(self, batch: Batch):
-        if self.fails == "input":
-            raise InputError("nothing to count")
-        if self.fails == "dies":
-            os._exit(9)
-        return batch.generator(0).random(batch.runs)
-
-    def solve(self, batch, data):
-        return {JOINT_ESTIMATE_KEY: data}
-
-    def judge(self, batch, data, value):
-        time.sleep(self.takes)
-        return {JOINT_ESTIMATE_KEY: Sample({"x": value[JOINT_ESTIMATE_KEY]})}
-
-
 def test_processes_that_die_are_replaced(monkeypatch):
     """All are killed in the middle: the same numbers, and no batch twice. The setting is larger
     than a pipe's buffer.
@@ -143,7 +117,7 @@ def test_processes_that_die_are_replaced(monkeypatch):
     have_cores(monkeypatch, 1)
     one = engine.run(Counting(), 200, 1)
     assert (many.workers, one.workers) == (2, 1)
-    np.testing.assert_array_equal(*(r.values("x", *JOINT_ESTIMATE_KEY) for r in (many, one)))
+    np.testing.assert_array_equal(*(r.values("x", *COUNT_KEY) for r in (many, one)))
 
 
 @pytest.mark.slow
@@ -188,8 +162,8 @@ def test_what_is_kept_is_what_was_done(tmp_path):
         value = store.load(0, 0, task.batch)
         assert value.wall == done.wall
         np.testing.assert_array_equal(
-            value.samples[JOINT_ESTIMATE_KEY].values["x"],
-            done.samples[JOINT_ESTIMATE_KEY].values["x"],
+            value.samples[COUNT_KEY].values["x"],
+            done.samples[COUNT_KEY].values["x"],
         )
         assert store.load(0, 1, task.batch) is None
         assert store.load(0, 0, replace(task.batch, runs=4)) is None
