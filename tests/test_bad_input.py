@@ -134,7 +134,7 @@ def test_the_page_of_a_calibration_in_the_place_of_its_folder(tmp_path):
     for name in ("report.html", "calibration.json"):
         (tmp_path / name).write_text("x")
     done = run("export", tmp_path / "report.html", "--to", "c", "--json")
-    assert (done.code, done.json["code"]) == (2, "machine.not_a_file")
+    assert (done.code, done.json["code"]) == (2, "calibration.other_file")
     assert str(tmp_path) in done.json["next_step"]
 
 

@@ -239,6 +239,17 @@ def test_directions_of_the_prior_alone_contradict_no_noise():
     shares = NoiseShares(z, own, others, 1 - own - others)
     assert not shares.contradicts()
     assert shares.best == pytest.approx(1, abs=0.3)
+    assert shares.stated_chance(np.ones(1))[0] > 0.05
+
+
+def test_a_noise_stated_far_too_small_is_estimated():
+    """Where the prior has nearly all of the variance that is stated."""
+    z = np.random.default_rng(4).normal(size=(1, 60))
+    own, others = np.full((1, 60), 5e-3), np.full((1, 60), 1e-4)
+    z *= np.sqrt(100**2 * own + others + 1 - own - others)
+    shares = NoiseShares(z, own, others, 1 - own - others)
+    assert shares.contradicts()
+    assert shares.best == pytest.approx(100, rel=0.3)
 
 
 @pytest.mark.parametrize("name", ["edges", "h4", "h4-rods", "h4 with distances"])

@@ -66,7 +66,7 @@ def test_a_cable_is_a_spring_of_its_length(kind, tmp_path):
     for T in around_home(3):
         q = machine.inverse(T[None])[0]
         at = closure(layout, theta, q, T)
-        slope, distance = np.abs(at.by_reading), at.rows.distance
+        slope, distance = -at.by_reading, at.rows.distance  # of the lengths by the readings
         yields = sag(machine, T[None], TENSION * slope[None])[0]
         for leg in range(machine.n_joints):
 
@@ -76,7 +76,7 @@ def test_a_cable_is_a_spring_of_its_length(kind, tmp_path):
 
             reach = 5 * abs(yields[leg])
             reading = brentq(unstretched, q[leg] - reach, q[leg] + reach, xtol=1e-13)
-            assert abs(q[leg] - reading) == pytest.approx(abs(yields[leg]), rel=0.01)
+            assert q[leg] - reading == pytest.approx(yields[leg], rel=0.01)
 
 
 def test_a_drive_and_its_cable_are_in_series(tmp_path):

@@ -41,6 +41,7 @@ async function measured(href: string): Promise<number> {
   context.drawImage(image, 0, 0, SAMPLES, SAMPLES);
   const levels = context.getImageData(0, 0, SAMPLES, SAMPLES).data.filter((_, k) => k % 4 === 1).sort();
   const median = Math.max(levels[levels.length >> 1], 1) / 255;
+  if (median >= GREY_CARD) return 1;
   const { min, step } = EXPONENTS;
   return Math.min(Math.max(Math.round(Math.log(GREY_CARD) / Math.log(median) / step) * step, min), 1);
 }

@@ -157,16 +157,14 @@ def loaded(origin: SavedCalibration | Machine | Path | str) -> SavedCalibration 
         path = path.parent  # the mechanism file of a calibration
     if path.is_dir() or path.name == CALIBRATION_DOCUMENT_FILE:
         return load(path)
-    if path.is_file() and path.suffix not in (".yaml", ".yml"):
+    beside = path.is_file() and (path.parent / CALIBRATION_DOCUMENT_FILE).is_file()
+    if beside and path.suffix not in (".yaml", ".yml"):
         raise InputError(
             "this file is neither a calibration nor a mechanism file",
             where=str(origin),
-            expected="a folder that pkmcal calibrate wrote, or a mechanism file with the ending"
-            " .yaml",
-            next_step=f"Name the folder, {path.parent}"
-            if (path.parent / CALIBRATION_DOCUMENT_FILE).is_file()
-            else None,
-            code="machine.not_a_file",
+            expected="the calibration's folder, or its mechanism file",
+            next_step=f"Name the folder, {path.parent}",
+            code="calibration.other_file",
         )
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         raise InputError(

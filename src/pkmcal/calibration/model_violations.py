@@ -527,8 +527,10 @@ def _sag(
     poses = estimate.state.T_base_platform[used]
     by = np.zeros((*measured.joints.shape, 1))
     by[used, :, 0] = weight_on_readings(machine, poses) if forces is None else forces[used]
-    shift = tool_shift(machine, poses, by[used, :, 0])
-    size = float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1))))
+    size = np.nan  # no tool follows from the readings of legs that do not hold the platform
+    if not machine.layout.underdetermined:
+        shift = tool_shift(machine, poses, by[used, :, 0])
+        size = float(np.sqrt(np.nanmean(np.sum(shift**2, axis=-1))))
 
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
         return {
@@ -536,7 +538,8 @@ def _sag(
             "sigma": sigma[0],
             "by": "load" if forces is None else "forces",
             "mass": load.mass if load and forces is None else None,
-            "sinks": size * value[0],
+            "unit": "m/N" if machine.joint_units[0] == "m" else "rad/(N m)",
+            "sinks": size * value[0] if np.isfinite(size) else None,
             "stiffness": 1 / value[0] if value[0] > 0 else None,
         }
 

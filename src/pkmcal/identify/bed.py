@@ -18,7 +18,7 @@ from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import columns_of, eliminate_beside, prior_root
-from pkmcal.identify.tool import pose_by_parameters, reachable
+from pkmcal.identify.tool import closed_poses, pose_by_parameters
 from pkmcal.levels import ROUNDING
 from pkmcal.measurements import Column
 from pkmcal.mechanisms import Machine, machine_from_document
@@ -81,7 +81,7 @@ def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
     """
     machine = estimate.machine
     poses = _over_the_disc(estimate.state.T_base_platform[estimate.configurations])
-    joints, poses = reachable(machine, poses)
+    joints, poses = closed_poses(machine, poses)
     by = pose_by_parameters(machine, joints, poses)[:, 3:]
     xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)
     plane = np.column_stack([np.ones(len(xy)), xy])

@@ -21,7 +21,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
-from pkmcal.identify.tool import pose_by_parameters, reachable
+from pkmcal.identify.tool import closed_poses, pose_by_parameters
 from pkmcal.levels import ALIGNED_ANGLE, NAMED_SHARE, NEARLY_ALL, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
@@ -483,7 +483,7 @@ def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
         if len(coefficients) > 1:
             return ""
         what, unit = changes(coefficients[0], labels)
-        joints, poses = reachable(s.machine, s.T_base_platform)
+        joints, poses = closed_poses(s.machine, s.T_base_platform)
         shifted = pose_by_parameters(s.machine, joints, poses)
         shifted = shifted @ columns @ coefficients[0] * unit
         xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)

@@ -145,7 +145,7 @@ class NoiseShares:
         """Factor s (B,) of the highest likelihood, 0 where that is the smallest value of the
         grid.
         """
-        return np.sqrt(self.highest[0])
+        return np.sqrt(self.maximum_likelihood[0])
 
     def factor(self) -> Array:
         """Factor (B,) on the kind's noise for the next step.
@@ -194,12 +194,11 @@ class NoiseShares:
         """
         from scipy.special import chdtrc
 
-        shares = self._only(
-            self.own > NEGLIGIBLE * self.own.max(axis=1, keepdims=True, initial=0.0)
-        )
+        informative = self.own > NEGLIGIBLE * self.own.max(axis=1, keepdims=True, initial=0.0)
+        shares = self._only(informative & self._in_likelihood)
         variance = shares.own / scale[:, None] ** 2 + shares.others + shares.fixed
         stated = np.sum(np.log(variance) + shares.z**2 / variance, axis=-1)
-        return chdtrc(2, np.maximum(stated - shares.highest[1], 0.0))
+        return chdtrc(2, np.maximum(stated - shares.maximum_likelihood[1], 0.0))
 
     def _only(self, directions: Booleans) -> NoiseShares:
         """Only some directions (B, n), the others as padding."""
@@ -208,10 +207,18 @@ class NoiseShares:
         )
         return NoiseShares(z, own, others, np.where(directions, self.fixed, 1.0), self.options)
 
+    @property
+    def _in_likelihood(self) -> Booleans:
+        """Directions (B, n) in the likelihood: all but those of the prior alone, in which the
+        data's share would be negligible with the largest tenable noise, too.
+        """
+        most = (self.own + self.others) * self.options.largest_others**2
+        return most > NEGLIGIBLE * self.fixed
+
     @cached_property
     def _by_data(self) -> NoiseShares:
-        """The directions in the likelihood: all but those of the prior alone."""
-        return self._only(self.fixed <= 1 - NEGLIGIBLE)
+        """The directions in the likelihood."""
+        return self._only(self._in_likelihood)
 
     @cached_property
     def _intervals(self) -> dict[float, tuple[Array, Array]]:
@@ -225,7 +232,7 @@ class NoiseShares:
         n_runs, n = self.z.shape
         if not n:
             return np.zeros(n_runs), np.full(n_runs, np.inf)
-        (best, least), tried = self.highest, self.options.log_variances
+        (best, least), tried = self.maximum_likelihood, self.options.log_variances
         level = least + chdtri(1, chance)
         inside = self._grid <= level[:, None]
         with np.errstate(divide="ignore"):
@@ -285,7 +292,7 @@ class NoiseShares:
         return self._profile(np.broadcast_to(tried, (len(self.z), len(tried))))[0]
 
     @cached_property
-    def highest(self) -> tuple[Array, Array]:
+    def maximum_likelihood(self) -> tuple[Array, Array]:
         """s^2 (B,) of the highest likelihood, and -2 log likelihood there."""
         run, at = np.arange(len(self.z)), np.argmin(self._grid, axis=1)
         tried = self.options.log_variances

@@ -122,10 +122,10 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     value = on_manifold(layout, machine.values, start)
     own = on_manifold(layout, machine.values, T_base_platform).singularity
     regular = value.converged & (value.singularity >= _SAMPLING.regular * float(np.nanmedian(own)))
-    return reachable(machine, np.concatenate([T_base_platform, value.T_base_platform[regular]]))
+    return closed_poses(machine, np.concatenate([T_base_platform, value.T_base_platform[regular]]))
 
 
-def reachable(machine: Machine, poses: Array) -> tuple[Array, Array]:
+def closed_poses(machine: Machine, poses: Array) -> tuple[Array, Array]:
     """Readings (n, m) and poses (n, 4, 4), of those poses (N, 4, 4) that the machine can take.
 
     Estimated poses close the machine up to the readings' noise: where cranks and rods are nearly in
@@ -135,7 +135,7 @@ def reachable(machine: Machine, poses: Array) -> tuple[Array, Array]:
     closes = np.isfinite(joints).all(axis=-1)
     if not closes.any():
         raise ResultError(
-            what="the estimated machine can take none of the poses at which it was measured"
+            what="the estimated machine can take none of the poses at which it is judged"
         )
     return joints[closes], poses[closes]
 

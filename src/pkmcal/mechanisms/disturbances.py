@@ -69,8 +69,8 @@ def sag(machine: Machine, poses: Array, forces: Array | None = None) -> Array:
     """What each reading's drive and legs yield by (..., m), m or rad; zero where the file states
     neither a stiffness nor a rigidity.
 
-    forces : (..., m) measured on the readings, N, of cranks and spools N m, positive where they
-        lengthen a leg; None for those of the load.
+    forces : (..., m) measured on the readings, N, of cranks and spools N m, positive where readings
+        grow; None for those of the load.
     """
     if not is_compliant(machine):
         return np.zeros((*poses.shape[:-2], machine.n_joints))

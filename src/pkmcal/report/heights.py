@@ -74,7 +74,7 @@ def _in_mm(heights: ProbedHeights, k: int) -> list[float]:
 def _maps(session: Session, heights: ProbedHeights) -> list[Plot]:
     """Maps of the errors over the bed, before and after, on one scale of colours."""
     errors = {"Before": heights.before, "After": heights.after}
-    most = 1e3 * max(float(np.nanmax(np.abs(values))) for values in errors.values())
+    most = 1e3 * float(np.nanmax(np.abs([heights.before, heights.after]), initial=1e-9))  # not zero
     out: list[Plot] = []
     for title, values in errors.items():
         points: list[Point] = []

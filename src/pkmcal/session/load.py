@@ -149,8 +149,8 @@ class Session:
     rejected : stations that were removed because their images do not determine their poses.
     links : measurements that depend on two configurations, by kind.
     temperature : (K,) °C, of the configurations; None where joints.csv has none.
-    forces : (K, m) on the readings, N or N m, positive where they lengthen a leg; None where
-        joints.csv has none.
+    forces : (K, m) on the readings, N or N m, positive where readings grow; None where joints.csv
+        has none.
     earlier_joints : (E, m) readings of the same machine at other poses; None for none. The
         localization of few images is tested against them as well.
     reading_units : units in the heads of joints.csv's m columns, None for SI; empty without any.
@@ -437,8 +437,11 @@ def _forces(machine: Machine, logged: JointTable) -> list[Finding]:
     if forces is None:
         return [] if machine.document.load else [doubtful("readings.forces_unknown", label)]
     home = machine.home()
-    shift = tool_shift(machine, home, sag(machine, home, forces))
-    distance = np.linalg.norm(shift, axis=-1)
+    yields = sag(machine, home, forces)
+    if machine.layout.underdetermined:  # no tool follows from the readings
+        distance = np.where(np.array(machine.joint_units) == "m", np.abs(yields), 0.0).max(axis=-1)
+    else:
+        distance = np.linalg.norm(tool_shift(machine, home, yields), axis=-1)
     row, most = int(np.argmax(np.nan_to_num(distance))), NEGLIGIBLE * machine.size
     if distance[row] > most:
         raise InputError(

@@ -42,8 +42,10 @@ TEMPERATURE_RANGE = (-100.0, 200.0)
 """Temperatures of machines, °C: beyond them they are in kelvin, or °C under kelvin."""
 
 
-FORCE_HEAD = re.compile(r"(.+) (?:force|tension|torque)(?: ?[\[(](?:(k?N)|(N ?m))[\])])?")
+FORCE_HEAD = re.compile(r"(.+) (?:force|tension|torque)(?: ?[\[(](.+)[\])])?", re.IGNORECASE)
 """Head of a column of forces; its groups are the reading's column, and the unit."""
+FORCE_UNITS = {"m": {"N": 1.0, "kN": 1e3}, "rad": {"N m": 1.0, "Nm": 1.0}}
+"""Units of the force on a reading in metres or radians, and their factors."""
 
 
 @dataclass(frozen=True)
@@ -78,22 +80,24 @@ def joint_table(whole: CsvTable, units: Sequence[str]) -> JointTable:
             "the columns of forces are not those of the readings",
             where=f"{table.label}, line 1",
             found=", ".join(table.columns[count:]),
-            expected=", ".join(f"{name} force" for name in readings.columns),
+            expected=", ".join(f"{name} force" for name in readings.columns)
+            or "the readings in front of their forces",
             next_step="Write one force for each reading, in the order of the readings",
             code="readings.forces",
         )
     factors = []
     for column, head, unit in zip(table.columns[count:], heads[count:], units, strict=False):
-        if head and head[2 if unit == "rad" else 3]:
+        stated, allowed = head[2] if head else None, FORCE_UNITS[unit]
+        if stated is not None and stated not in allowed:
             raise InputError(
                 "this force is in another unit than its reading needs",
                 where=f"{table.label}, line 1",
                 found=column,
                 expected="N m, since the reading is an angle" if unit == "rad"
-                else "N, since the reading is a length",
+                else "N or kN, since the reading is a length",
                 code="readings.force_unit",
             )  # fmt: skip
-        factors.append(1e3 if head and head[2] == "kN" else 1.0)
+        factors.append(1.0 if stated is None else allowed[stated])
     factors += [1.0] * (len(of) - len(factors))  # the number of readings is checked later
     return JointTable(readings, table.values[:, count:] * factors, temperature)
 

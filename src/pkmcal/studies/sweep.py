@@ -247,7 +247,7 @@ def _value(name: str, varied: Varied, unit: str, text: str) -> Value:
         )
     value = math.nan
     with suppress(ValueError):
-        value = read_quantity(text, unit)
+        value = float(text) if varied.whole else read_quantity(text, unit)
     good = varied.least <= value <= varied.most and not (varied.whole and value % 1)
     if not good:
         most = f" to {varied.most:g}" if math.isfinite(varied.most) else " or more"
