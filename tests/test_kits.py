@@ -112,7 +112,7 @@ def test_what_looks_as_flat_is_what_the_sentence_states(by_heights):
     )
     numbers = re.search(
         r"with \+1 mm of the rod length and \+(\S+) mm of the base radius, the bed "
-        r"looks as flat, and x and y (stretch|shrink) by (\S+)%",
+        r"looks as flat, and x and y (stretch|shrink) by (\S+) %",
         text,
     )
     assert numbers

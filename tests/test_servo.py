@@ -429,7 +429,7 @@ def test_how_far_a_platform_leaves_its_way(eye):
     here, there = (platform_joints(machine, T) for T in (runs, ideal))
     nearest = [min(np.sqrt(np.mean(np.sum((p - q) ** 2, axis=-1))) for q in there) for p in here]
     assert hand[0] == pytest.approx(max(nearest), rel=1e-12)
-    assert any("beside its way" in text for text in judgement(value).warnings)
+    assert judgement(value).of("servo.by_hand_astray")
 
 
 def test_the_seed_decides(eye):

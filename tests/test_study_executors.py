@@ -222,7 +222,7 @@ def test_an_impossible_combination_is_named_before_the_others_are_done(tmp_path,
     vary = [SMALL[1], "stations=1", "focal=900", "distance=2,0.1"]
     with raises(InputError, code="station.sees_too_little") as caught:
         study("3-rpr", vary, runs=20, out=tmp_path)
-    assert caught.value.where.endswith(", distance 0.1")
+    assert caught.value.where.endswith(", distance 0.1 m")
     assert len(list(tmp_path.glob("batches/*.npz"))) == 1
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from pkmcal.api.result import PAGE_DESCRIPTION, FolderResult
-from pkmcal.calibration.calibrate import Calibration, calibrate_session
+from pkmcal.calibration.calibrate import Calibration, calibrate_session, check_options
 from pkmcal.calibration.results import check_output
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.errors import InputError
@@ -107,6 +107,7 @@ def calibrate(
         These data do not allow a result.
 
     """
+    check_options(method, seed, holdout)
     with whole(progress, "Reading the session") as report:
         if not isinstance(session, Session):
             session = load_session(session, model)

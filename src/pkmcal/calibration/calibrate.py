@@ -194,7 +194,7 @@ def calibrate_session(
     """
     from threadpoolctl import threadpool_limits
 
-    _check_options(method, seed, holdout)
+    check_options(method, seed, holdout)
     # Matrices here are small: threads inside the linear algebra only wait for one another, and
     # beside our own threads they slow it twentyfold.
     with threadpool_limits(1, "blas"):
@@ -303,7 +303,7 @@ def calibrate_measurements(
     return _judge(case, _Identified(turns, estimate, None, None), (), (), "bundle", 0, clock)
 
 
-def _check_options(method: str, seed: int, holdout: int) -> None:
+def check_options(method: str, seed: int, holdout: int) -> None:
     """Raise InputError for options without a meaning."""
     if method not in CALIBRATION_METHODS:
         guess = closest(str(method), CALIBRATION_METHODS)
