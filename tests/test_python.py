@@ -285,7 +285,7 @@ def test_a_result_is_saved_as_the_command_saves_it(result, demo, tmp_path):
         ("method", "bundel", "'bundel'", "bundle"),
         ("method", "best", "'best'", "bundle, four-step, linear and inverse-kinematic"),
         ("method", None, "nothing", "bundle, four-step, linear and inverse-kinematic"),
-        ("seed", -1, "-1", "a whole number, 0 to 9.22337e+18"),
+        ("seed", -1, "-1", "a whole number, 0 or more"),
         ("holdout", -2, "-2", "a whole number, 0 to 100000"),
     ],
 )
