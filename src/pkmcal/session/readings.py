@@ -42,8 +42,8 @@ TEMPERATURE_RANGE = (-100.0, 200.0)
 """Temperatures of machines, °C: beyond them they are in kelvin, or °C under kelvin."""
 
 
-FORCE_HEAD = re.compile(r"(.+) (?:force|tension|torque)(?: ?[\[(](.+)[\])])?", re.IGNORECASE)
-"""Head of a column of forces; its groups are the reading's column, and the unit."""
+FORCE_WORDS = ("force", "tension", "torque")
+"""Words after a reading's name in the head of a column of forces."""
 FORCE_UNITS = {"m": {"N": 1.0, "kN": 1e3}, "rad": {"N m": 1.0, "Nm": 1.0}}
 """Units of the force on a reading in metres or radians, and their factors."""
 
@@ -69,12 +69,12 @@ def joint_table(whole: CsvTable, units: Sequence[str]) -> JointTable:
     or in another unit, and for temperatures of no machine.
     """
     table, temperature = _without_temperature(whole)
-    heads = [FORCE_HEAD.fullmatch(column) for column in table.columns]
+    heads = [_force_head(column) for column in table.columns]
     count = next((k for k, head in enumerate(heads) if head), len(heads))
     readings = _first_columns(table, count)
     if count == len(heads):
         return JointTable(readings, None, temperature)
-    of = [head[1] if head else None for head in heads[count:]]
+    of = [head[0] if head else None for head in heads[count:]]
     if of != list(readings.columns):
         raise InputError(
             "the columns of forces are not those of the readings",
@@ -87,8 +87,8 @@ def joint_table(whole: CsvTable, units: Sequence[str]) -> JointTable:
         )
     factors = []
     for column, head, unit in zip(table.columns[count:], heads[count:], units, strict=False):
-        stated, allowed = head[2] if head else None, FORCE_UNITS[unit]
-        if stated is not None and stated not in allowed:
+        stated, allowed = head[1] if head else "", FORCE_UNITS[unit]
+        if stated and stated not in allowed:
             raise InputError(
                 "this force is in another unit than its reading needs",
                 where=f"{table.label}, line 1",
@@ -97,9 +97,16 @@ def joint_table(whole: CsvTable, units: Sequence[str]) -> JointTable:
                 else "N or kN, since the reading is a length",
                 code="readings.force_unit",
             )  # fmt: skip
-        factors.append(1.0 if stated is None else allowed[stated])
+        factors.append(allowed[stated] if stated else 1.0)
     factors += [1.0] * (len(of) - len(factors))  # the number of readings is checked later
     return JointTable(readings, table.values[:, count:] * factors, temperature)
+
+
+def _force_head(column: str) -> tuple[str, str] | None:
+    """Reading and unit, empty without one, of a column of forces; None for other columns."""
+    name, _, unit = column.replace("(", "[").rstrip("])").partition("[")
+    of, _, word = name.strip().rpartition(" ")
+    return (of, unit.strip()) if of and word.lower() in FORCE_WORDS else None
 
 
 def _first_columns(table: CsvTable, count: int) -> CsvTable:
