@@ -344,11 +344,26 @@ def test_a_session_of_one_image_is_viewed_and_placed(session, truth):
     angle, distance = off(value["overlay"]["pose"], true)
     assert angle < 1.5
     assert distance < 25
-    # another leg taken for leg 1, and then beside the place: right, or not placed
+    assert not value["places"]
+    # another leg taken for leg 1, and then beside the place: right, or offered among other places
     for turn in (2 * np.pi / 3, 0.2):
         mistaken = rough @ pose(rotation(turn * np.array([0.0, 0.0, 1.0])), np.zeros(3))
         value = opened.ask("localize", pose=mistaken.tolist())
+        places = value["places"] or [value["overlay"]["pose"]]
+        assert min(off(place, true)[0] for place in places) < 1.5
         assert not value["localized"] or off(value["overlay"]["pose"], true)[0] < 1.5
+    # a leg that a person numbers: where it is, and where another leg is
+    joints = opened.ask("overlay", pose=true.tolist())["joints"]
+    first, fourth = (
+        {"image": 0, "leg": 1, "end": "axis", "pixel": np.mean(ends, axis=0).tolist()}
+        for ends in ([one["at"] for one in joints if one["leg"] == leg] for leg in (1, 4))
+    )
+    value = opened.ask("localize", pose=rough.tolist(), pins=[first])
+    assert value["localized"]
+    assert off(value["overlay"]["pose"], true)[0] < 1.5
+    value = opened.ask("localize", pose=rough.tolist(), pins=[fourth])
+    assert not value["localized"]
+    assert all(off(place, true)[0] > 10 for place in value["places"])
     assert pkmcal.view(session).document["kind"] == "session"
 
 
@@ -941,6 +956,9 @@ def test_a_session_is_worked_on_in_a_browser(session, demo, truth, tmp_path, wid
     assert int(root["measured"]) > 0
     assert (root["ghosts"], root["during"].strip(), root["filled"]) == ("0", "session-fit", "1")
     assert root["changed"] == "true"
+    assert json.loads(root["numbered"]) == ["You: leg 2 is here"]
+    assert (root["number_moves"], root["unnumbered"]) == ("false", "0")
+    assert (root["refused"], root["offered"]) == ("session-status bad", "0")
     # then all images of the station fit
     assert root["status"] == root["saved"] == "session-status good"
     assert root["fitted"] == root["calibrated"] == "session-fit good"

@@ -92,6 +92,24 @@ addEventListener("load", async () => {
   out.farther = JSON.stringify([before, joint("platform", 2)]);
   key("z", { ctrlKey: true });
   await settled();
+
+  // a number at a leg, in place of another one, is removed by a second click
+  press("Number legs");
+  const click = (leg) => { press(leg); pointer("pointerdown", before); pointer("pointerup", before); };
+  const numbers = () => all(".joints .shape").map((one) => one.dataset.tip).filter((tip) => tip.startsWith("You"));
+  click("3"); click("2");
+  out.numbered = JSON.stringify(numbers());
+  out.number_moves = !all("button").find((one) => one.textContent.startsWith("Write")).disabled;
+  click("2");
+  out.unnumbered = numbers().length;
+  // a number that no place agrees with: other places are offered, and Undo returns from them
+  pointer("pointerdown", [2, 2]); pointer("pointerup", [2, 2]);
+  press("Fit");
+  await settled();
+  out.refused = $(".session-status").className;
+  out.offered = all(".session-places:not([hidden]) button").length;
+  key("z", { ctrlKey: true });
+  await settled();
   press("Move");
 
   // two joints at their places: the machine is localized, and the pose saved

@@ -1176,11 +1176,19 @@ export interface JointPixel {
 }
 /**
  * Result of a localization: the overlay at the pose, which is unchanged without success.
+ *
+ * places : poses between which a person can choose, likeliest first, without success.
  */
 export interface LocalizationAnswer {
   localized: boolean;
   text: string;
   overlay: OverlayAnswer;
+  places: [
+    [number, number, number, number],
+    [number, number, number, number],
+    [number, number, number, number],
+    [number, number, number, number]
+  ][];
 }
 /**
  * Overlaid machine after the request's gesture and pins.
@@ -1204,14 +1212,15 @@ export interface OverlayAnswer {
   joints: JointPixel[];
 }
 /**
- * Joint placed at a pixel of an image.
+ * What a person says of a pixel of an image: a leg's joint is there, or the leg itself.
  *
  * image : index in the station.
+ * end : which joint; axis for any place along the leg.
  * leg : from 1.
  */
 export interface Pin {
   image: number;
-  end: "base" | "platform";
+  end: ("base" | "platform") | "axis";
   leg: number;
   /**
    * @minItems 2

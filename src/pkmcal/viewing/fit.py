@@ -33,12 +33,16 @@ A search uses eight and verifies with the others, in about a second; `calibrate`
 """
 FEWEST_FITTED_TOGETHER = 2
 """Fewest images of which some can verify the pose that the others give."""
+MOST_PLACES = 5
+"""Poses between which a person can choose."""
 LEAST_CHANCE_DISPLAYED = 1e-9
 """Probability below which no digits are displayed."""
 
 
 class _Judgement(NamedTuple):
-    """Likeliest pose (4, 4), whether the machine is localized there, and the reason as text."""
+    """Poses (H, 4, 4), likeliest first, whether the machine is localized at the first, and the
+    reason as text.
+    """
 
     T_camera_base: Array
     localized: bool
@@ -46,20 +50,20 @@ class _Judgement(NamedTuple):
 
 
 class _PlacedJoints(NamedTuple):
-    """Joints that a person placed, and the pose (4, 4) at which they are."""
+    """Joints that a person placed, with the pose (4, 4) at which they are, and numbered legs."""
 
     content: SessionContent
     request: ViewRequest
     start: Array
 
     def log_likelihood(self, T_camera_base: Array) -> float:
-        """Log-likelihood, nats, of the joints at a pose (4, 4)."""
+        """Log-likelihood, nats, of what was placed at a pose (4, 4)."""
         distance, sigma = pin_distances(self.content, self.request, T_camera_base)
         return -0.5 * float(np.sum((distance / sigma) ** 2))
 
     def contradiction(self, T_camera_base: Array) -> float:
         """Largest distance, px, by which a pose (4, 4) moves a joint farther than its error allows,
-        beyond the same at the start; 0 for none.
+        beyond the same at the start, or has a leg beside its number; 0 for none.
         """
         # a leg's silhouettes allow it to slide along itself; the joints placed by hand do not
         off, at_start = (
@@ -68,7 +72,9 @@ class _PlacedJoints(NamedTuple):
                 pin_distances(self.content, self.request, T) for T in (T_camera_base, self.start)
             )
         )
-        return float(off[off > at_start].max(initial=0.0))
+        # numbers do not move the machine, so nothing is known of them at the start
+        numbered = np.array([pin.end == "axis" for pin in self.request.pins], dtype=bool)
+        return float(off[(off > at_start) | numbered].max(initial=0.0))
 
 
 def localized_overlay(content: SessionContent, request: ViewRequest) -> LocalizationAnswer:
@@ -97,11 +103,17 @@ def localized_overlay(content: SessionContent, request: ViewRequest) -> Localiza
         judgement = _from_images(view, None if request.anywhere else start, joints)
     else:
         judgement = _from_one_image(view, near, joints)
-    pose = judgement.T_camera_base if judgement.localized else start
+    poses = judgement.T_camera_base
     # overlay at the localized pose, without the gesture and pins that led to the start
-    plain = {"pose": pose_rows(pose), "gesture": None, "pins": ()}
-    overlay = overlay_after_gesture(content, request.model_copy(update=plain))
-    return LocalizationAnswer(localized=judgement.localized, text=judgement.text, overlay=overlay)
+    pose = pose_rows(poses[0] if judgement.localized else start)
+    plain = {"pose": pose, "gesture": None, "pins": ()}
+    open_places = [T for T in poses if not judgement.localized and not joints.contradiction(T)]
+    return LocalizationAnswer(
+        localized=judgement.localized,
+        text=judgement.text,
+        overlay=overlay_after_gesture(content, request.model_copy(update=plain)),
+        places=tuple(pose_rows(T) for T in open_places[:MOST_PLACES]),
+    )
 
 
 def _from_images(view: StationView, start: Array | None, joints: _PlacedJoints) -> _Judgement:
@@ -129,7 +141,7 @@ def _from_images(view: StationView, start: Array | None, joints: _PlacedJoints) 
             " and try again, or check whether nominal model, readings and images"
             " belong together."
         )
-    return _Judgement(pose.T_camera_base, pose.good and not moved, text)
+    return _Judgement(pose.T_camera_base[None], pose.good and not moved, text)
 
 
 def _from_one_image(view: StationView, start: Array | None, joints: _PlacedJoints) -> _Judgement:
@@ -161,22 +173,23 @@ def _from_one_image(view: StationView, start: Array | None, joints: _PlacedJoint
         text = (
             "Not placed: from several places the machine fits this image nearly as well. The second"
             f" best, turned by {turn:.0f}° against the best, is the right one with probability"
-            f" {probability}. Bring joints of a leg whose number you know to their places: they"
-            " decide between these."
+            f" {probability}. Look at them, or number a leg that you know, or bring its joints to"
+            " their places: these decide."
         )
     else:
         text = (
             "Not placed: the best fit may be by chance, with probability"
             f" {probability}. Bring it to where it is, joint by joint."
         )
-    return _Judgement(pose.T_camera_base, pose.good and not moved, text)
+    return _Judgement(hypotheses.T_camera_base, pose.good and not moved, text)
 
 
 def _contradicted(moved: float) -> str:
     """Sentence on a fit that moves a joint placed by hand by ``moved`` px."""
     return (
-        f"Not placed: the best fit moves a joint that you placed by {brief(moved)} px"
-        " more than your hand and the nominal model allow, so your place is retained."
+        f"Not placed: the best fit moves a joint that you placed, or a leg that you numbered, by"
+        f" {brief(moved)} px more than your hand and the nominal model allow, so your place is"
+        " retained."
     )
 
 

@@ -33,10 +33,13 @@ from pkmcal.viewing.gestures import (
     rolled,
     turned_as_ball,
 )
-from pkmcal.web.session_document import JointPixel, OverlayAnswer, ViewRequest
+from pkmcal.web.session_document import JointPixel, OverlayAnswer, Pin, ViewRequest
 from pkmcal.web.stage import pose_row
 from pkmcal.wording import number
 
+AXIS_POINTS = 257
+"""Points of a leg's axis among which the nearest to a pixel is taken: a leg as long as an image is
+wide has one within a standard deviation of a hand."""
 STATION_POSE_DECIMALS = 4
 """Decimals of a written position in m; nobody places a camera to a tenth of a millimetre."""
 
@@ -94,9 +97,12 @@ def placed_by_hand(content: SessionContent, request: ViewRequest) -> Pane:
     if T_camera_base is None:
         T_camera_base = pane.T_camera_base
     camera, points = pane.camera, pane.points.reshape(-1, 3)
-    # pins first, then the gesture
-    if request.pins:
-        T_camera_base = pinned(camera, T_camera_base, points, *_pins(content, request))
+    # pinned joints first, then the gesture
+    joints = [pin for pin in request.pins if pin.end != "axis"]
+    if joints:
+        ends = np.array([_place_on_leg(content, request, pin) for pin in joints])[:, 0]
+        pixels = np.array([pin.pixel for pin in joints], dtype=float)
+        T_camera_base = pinned(camera, T_camera_base, points, ends, pixels)
     if request.gesture is not None:
         start, end = (
             np.array(p, dtype=float) for p in (request.gesture.start, request.gesture.end)
@@ -124,38 +130,40 @@ def place_of(T_camera_base: Array) -> dict[str, list[float]]:
 def pin_distances(
     content: SessionContent, request: ViewRequest, T_camera_base: Array
 ) -> tuple[Array, Array]:
-    """Distances (n,), px, of pinned joints at a pose (4, 4) from where they were placed, and their
-    standard deviations (n,), px, by hand and by the nominal model's tolerance.
+    """Distances (n,), px, of what was pinned at a pose (4, 4) from where it was placed, and their
+    standard deviations (n,), px: by hand, by the nominal model's tolerance and, of a leg, by its
+    width.
     """
     pane = pane_of(content, request)
-    pins, pixels = _pins(content, request)
-    points = apply(T_camera_base, pins)
-    visible = pane.camera.project(points)
-    # pixels of the tolerance, across the line of sight
-    shift = pane.machine.document.tolerance.center * np.eye(3)[0]
-    sigma = np.hypot(*(pane.camera.project(points + shift) - visible).T)
-    distances = np.nan_to_num(np.hypot(*(visible - pixels).T), nan=UNSEEN_JOINT_PIXELS)
-    return distances, np.hypot(np.nan_to_num(sigma), PINNED_JOINT_SIGMA)
+    camera, tolerance = pane.camera, pane.machine.document.tolerance.center
+    distances, sigmas = np.zeros((2, len(request.pins)))
+    for k, pin in enumerate(request.pins):
+        points = apply(T_camera_base, _place_on_leg(content, request, pin))
+        visible = camera.project(points)
+        away = np.nan_to_num(np.hypot(*(visible - pin.pixel).T), nan=UNSEEN_JOINT_PIXELS)
+        nearest = int(np.argmin(away))
+        tubes = pane.machine.document.legs[pin.leg - 1].tubes if pin.end == "axis" else []
+        spread = np.hypot(tolerance, max((tube.radius for tube in tubes), default=0.0))
+        # pixels of the spread, across the line of sight
+        shifted = camera.project(points[nearest] + spread * np.eye(3)[0])
+        distances[k] = away[nearest]
+        sigmas[k] = np.nan_to_num(np.hypot(*(shifted - visible[nearest])))
+    return distances, np.hypot(sigmas, PINNED_JOINT_SIGMA)
 
 
-def _pins(content: SessionContent, request: ViewRequest) -> tuple[Array, Array]:
-    """Pinned joints (n, 3), base frame, m, and their pixels (n, 2)."""
-    pins = [_joint(content, request, k) for k in range(len(request.pins))]
-    pixels = np.array([pin.pixel for pin in request.pins], dtype=float)
-    return np.reshape(pins, (-1, 3)), pixels.reshape(-1, 2)
-
-
-def _joint(content: SessionContent, request: ViewRequest, k: int) -> Array:
-    """Centre (3,) of a pinned joint, base frame, m, in the configuration of the pin's image.
+def _place_on_leg(content: SessionContent, request: ViewRequest, pin: Pin) -> Array:
+    """Points (n, 3) of which one was pinned, base frame, m, in the configuration of the pin's
+    image: a joint's centre, or points along a leg.
 
     Raises InputError for a leg that the machine lacks.
     """
-    pin = request.pins[k]
-    other = request.model_copy(update={"image": pin.image})
-    points = pane_of(content, other).points[0 if pin.end == "base" else 1]
-    if pin.leg > len(points):
-        raise InputError("there is no such leg", where=f"the page, pins[{k + 1}]", found=pin.leg)
-    return points[pin.leg - 1]
+    base, platform = pane_of(content, request.model_copy(update={"image": pin.image})).points
+    if pin.leg > len(base):
+        where = f"the page, pins[{request.pins.index(pin) + 1}]"
+        raise InputError("there is no such leg", where=where, found=pin.leg)
+    along = {"base": [0.0], "platform": [1.0], "axis": np.linspace(0, 1, AXIS_POINTS)}[pin.end]
+    a, b = base[pin.leg - 1], platform[pin.leg - 1]
+    return a + np.array(along)[:, None] * (b - a)
 
 
 def _bare_limbs(pane: Pane) -> list[EdgeCurve]:

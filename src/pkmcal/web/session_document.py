@@ -38,14 +38,15 @@ class SessionStation(Schema):
 
 
 class Pin(Schema):
-    """Joint placed at a pixel of an image.
+    """What a person says of a pixel of an image: a leg's joint is there, or the leg itself.
 
     image : index in the station.
+    end : which joint; axis for any place along the leg.
     leg : from 1.
     """
 
     image: int
-    end: JointEnd
+    end: JointEnd | Literal["axis"]
     leg: int = Field(ge=1)
     pixel: Pixel
 
@@ -127,11 +128,15 @@ class EdgesAnswer(Schema):
 
 
 class LocalizationAnswer(Schema):
-    """Result of a localization: the overlay at the pose, which is unchanged without success."""
+    """Result of a localization: the overlay at the pose, which is unchanged without success.
+
+    places : poses between which a person can choose, likeliest first, without success.
+    """
 
     localized: bool
     text: Text
     overlay: OverlayAnswer
+    places: tuple[Pose, ...]
 
 
 class SavedAnswer(Schema):

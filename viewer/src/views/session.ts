@@ -27,7 +27,7 @@ import { ImageList, type ImageMark } from "./session_images";
 import { type Pose, StationPose } from "./session_poses";
 
 type MachineChoice = ViewRequest["machine"];
-type Kind = Gesture["kind"] | "pan";
+type Kind = Gesture["kind"] | "number" | "pan";
 
 const DISTANCE_STEP = 1.05; // ratio of distances, of one press
 const DRAG_STEP = 12; // screen pixels of a drag for the same
@@ -41,15 +41,18 @@ const KINDS: [Kind, string, string][] = [
   ["turn", "Turn", "Turn the machine about its middle; Shift and drag"],
   ["roll", "Roll", "Turn it about the line of sight; Alt and drag"],
   ["distance", "Distance", "Drag up: farther; Page Up and Page Down"],
+  ["number", "Number legs", "Click on a leg: it is the one of this number; click again: it is not"],
   ["pan", "Pan", "Drag the image; two fingers do so always"],
 ];
 const HELP = "Drag the machine to where the image has it. A joint that is dragged stays where it is put: the"
   + " first moves the machine, the second turns and scales it, and then the machine is localized as by Fit."
+  + " A machine of equal legs looks alike from several sides: number a leg that you know, and Fit takes it for that one."
   + " Shift turns, Alt rolls, Page Up and Page Down change the distance; the wheel zooms the image."
   + " ← → previous and next image, ↑ ↓ stations.";
 
 interface Drag {
-  kind: Gesture["kind"];
+  kind: Exclude<Kind, "pan">;
+  reach: number;
   joint: JointPixel | null;
   start: Pixel;
   screen: { x: number; y: number };
@@ -67,6 +70,7 @@ class SessionView {
   private k = 0;
   private machine: MachineChoice = "nominal";
   private kind: Kind = "aim";
+  private leg = 1; // whose number a click places
   private readonly poses: StationPose[];
   private readonly marks: Record<MachineChoice, ImageMark[][]>;
   /** Answers about another image, machine or pose than the present one are dropped. */
@@ -87,6 +91,7 @@ class SessionView {
   private readonly inspector: Inspector;
   private readonly where = h("h2", {});
   private readonly status = h("div", { class: "session-status", role: "status", "aria-live": "polite", hidden: true });
+  private readonly places = h("div", { class: "bar session-places", hidden: true });
   private readonly fit = h("div", { class: "session-fit" });
   private readonly counts: HTMLElement[];
   private readonly reasons = h("ul", { class: "small" });
@@ -96,6 +101,7 @@ class SessionView {
   private readonly machines: HTMLElement;
   private readonly views: HTMLElement;
   private readonly kinds: HTMLElement;
+  private readonly numbers: HTMLElement;
   private readonly undoButton = button("Undo", () => this.undo(), "Ctrl Z");
   private readonly fitButton = button("Fit", () => void this.localize(false), "Key f");
   private readonly searchButton = button("Search everywhere", () => void this.localize(true));
@@ -119,9 +125,13 @@ class SessionView {
       this.kind = name;
       this.showState();
     });
+    this.numbers = choice("Number of the leg", Array.from({ length: legs }, (_, j): [string, string] => [String(j + 1), String(j + 1)]),
+      "1", (name) => {
+        this.leg = Number(name);
+      });
     for (const one of [this.fitButton, this.saveButton]) one.classList.add("main");
     const middle = (): Pixel => [(this.image.width - 1) / 2, (this.image.height - 1) / 2];
-    const tools = h("div", { class: "bar session-tools" }, this.kinds,
+    const tools = h("div", { class: "bar session-tools" }, this.kinds, this.numbers,
       h("span", { class: "choice", role: "group", "aria-label": "Distance" },
         button("Nearer", () => this.changeDistance(1 / DISTANCE_STEP, middle()), "Page Down"),
         button("Farther", () => this.changeDistance(DISTANCE_STEP, middle()), "Page Up")),
@@ -140,7 +150,7 @@ class SessionView {
           h("div", { class: "bar" }, this.where, this.views, this.machines),
           this.inspector.element, this.stage, ...this.editing),
         h("aside", { "aria-label": "Measurements and pose" },
-          this.status,
+          this.status, this.places,
           h("section", {}, h("h2", {}, "Measurements"), this.fit,
             h("ul", { class: "session-legs", "aria-label": "Legs, and how many of their edges are measured" },
               ...this.counts.map((cell, j) => h("li", { "data-key": `leg:${j + 1}` },
@@ -182,10 +192,10 @@ class SessionView {
   // ---------------------------------------------------------------- requests
 
   private request(more: Partial<ViewRequest> = {}, s = this.s, k = this.k): ViewRequest {
-    const { pose } = this.poses[s];
+    const { pose, numbers } = this.poses[s];
     return {
       station: s, image: k, machine: this.machine, pose: this.fixed ? null : pose, gesture: null,
-      pins: [], anywhere: false, ...more,
+      anywhere: false, ...more, pins: [...(more.pins ?? []), ...numbers],
     };
   }
 
@@ -264,7 +274,7 @@ class SessionView {
   private draw(answer: OverlayAnswer): void {
     if (!this.fixed) this.pose.pose = answer.pose as Pose;
     this.joints = answer.joints;
-    this.overlay = answer.layers.map((layer) => (layer.name === "joints" ? this.withPins(layer) : layer));
+    this.overlay = answer.layers;
     this.drawLayers();
     this.place.replaceChildren(...answer.place.flatMap(({ label, value }) => [h("dt", {}, label), h("dd", {}, value)]));
     this.showState();
@@ -279,8 +289,18 @@ class SessionView {
     return { ...layer, shapes };
   }
 
+  /** Numbers of legs in the image. */
+  private numbered(): Layer {
+    const pins = this.fixed ? [] : this.pose.numbers.filter((pin) => pin.image === this.k);
+    const shapes = pins.map(({ leg, pixel }) => ({
+      shape: "ring" as const, at: pixel, key: `leg:${leg}`, label: String(leg), filled: true, tip: `You: leg ${leg} is here`,
+    }));
+    return { name: "joints", shapes, enlargement: 1 };
+  }
+
   private drawLayers(): void {
-    const layers = [...this.overlay, ...this.measured]
+    const machine = this.overlay.map((layer) => (layer.name === "joints" ? this.withPins(layer) : layer));
+    const layers = [...machine, ...this.measured, this.numbered()]
       .sort((a, b) => ORDER.indexOf(a.name) - ORDER.indexOf(b.name));
     this.inspector.setOverlays([{ title: "", layers }]);
     this.selection.apply(this.inspector.element);
@@ -292,6 +312,7 @@ class SessionView {
     for (const element of this.editing) element.hidden = fixed || !this.stage.hidden;
     this.machines.hidden = !content.calibration || !this.stage.hidden; // in space, the calibrated one stands
     this.inspector.element.classList.toggle("session-editing", !fixed && this.kind !== "pan");
+    this.numbers.hidden = this.kind !== "number";
     this.undoButton.disabled = fixed || !pose.undoable;
     this.fitButton.disabled = this.searchButton.disabled = fixed || !station.legs;
     this.saveButton.disabled = fixed || !pose.changed;
@@ -340,6 +361,7 @@ class SessionView {
     if (!image) return;
     Object.assign(this, { s, k });
     this.notify("");
+    this.places.hidden = true;
     this.where.textContent = image.title;
     this.overlay = [];
     this.joints = [];
@@ -422,6 +444,7 @@ class SessionView {
     this.marks.nominal[this.s].fill(undefined);
     this.list.show(this.marks.nominal);
     this.notify("");
+    this.places.hidden = true;
     this.clearMeasured();
   }
 
@@ -441,7 +464,7 @@ class SessionView {
         const others = this.pose.pins.filter((pin) =>
           !(joint && pin.image === this.k && pin.end === joint.end && pin.leg === joint.leg));
         this.drag = {
-          kind, joint, others, start: at, screen: { x: event.clientX, y: event.clientY },
+          kind, reach, joint, others, start: at, screen: { x: event.clientX, y: event.clientY },
           pose: this.pose.pose, moved: false,
         };
         return true;
@@ -462,6 +485,7 @@ class SessionView {
     const { drag } = this;
     if (!drag) return;
     const { joint, kind, start, pose, screen } = drag;
+    if (kind === "number") return; // a click
     if (!drag.moved) {
       if (Math.hypot(event.clientX - screen.x, event.clientY - screen.y) < JITTER) return;
       drag.moved = true;
@@ -481,6 +505,7 @@ class SessionView {
   private async endDrag(cancelled: boolean): Promise<void> {
     const { drag } = this;
     this.drag = null;
+    if (drag?.kind === "number" && !cancelled) this.numberLeg(drag);
     if (!drag?.moved) return this.markOthers(); // which the drag interrupted
     if (cancelled) return this.undo();
     const { epoch } = this;
@@ -489,6 +514,27 @@ class SessionView {
     // two joints determine the place well enough for the machine to be localized there
     if (drag.joint && this.pose.pins.length >= PINS_TO_FIT && this.station.legs) await this.localize(false);
     else await this.measure();
+  }
+
+  /** Place the chosen leg's number at a pixel, or remove it from there. */
+  private numberLeg({ start, reach }: Drag): void {
+    const near = ({ image, pixel: [x, y] }: Pin): boolean => image === this.k && Math.hypot(x - start[0], y - start[1]) <= reach;
+    this.pose.number({ image: this.k, end: "axis", leg: this.leg, pixel: start }, near);
+    this.drawLayers();
+    this.showState();
+  }
+
+  /** Offer poses to look at, one after the other. */
+  private offer(poses: LocalizationAnswer["places"]): void {
+    this.places.hidden = !poses.length;
+    const names = poses.map((_, n): [string, string] => [String(n), String(n + 1)]);
+    const group = choice("Where the machine may be", names, "", (name) => {
+      this.begin();
+      this.pose.pins = [];
+      this.places.hidden = false;
+      void this.requestOverlay({ pose: poses[Number(name)] }).then(() => this.measure());
+    });
+    this.places.replaceChildren("It may be here: ", group);
   }
 
   /** Change the distance; presses in quick succession are one step. */
@@ -529,6 +575,7 @@ class SessionView {
       this.draw(answer.overlay);
     }
     this.notify(answer.text, answer.localized ? "good" : "bad");
+    this.offer(answer.places);
     await this.measure();
   }
 

@@ -6,6 +6,7 @@ export type Pose = NonNullable<ViewRequest["pose"]>;
 interface Step {
   pose: Pose | null;
   pins: Pin[];
+  numbers: Pin[];
   changed: boolean;
 }
 
@@ -14,6 +15,8 @@ export class StationPose {
   pose: Pose | null = null;
   /** Joints placed at pixels. */
   pins: Pin[] = [];
+  /** Legs numbered at pixels: they hold wherever the machine is. */
+  numbers: Pin[] = [];
   /** Whether session.yaml has another pose. */
   changed = false;
   private readonly before: Step[] = [];
@@ -26,9 +29,19 @@ export class StationPose {
 
   /** Begin a change. */
   begin(): void {
-    const { pose, pins, changed } = this;
-    this.before.push({ pose, pins, changed });
+    const { pose, pins, numbers, changed } = this;
+    this.before.push({ pose, pins, numbers, changed });
     this.changed = true;
+  }
+
+  /** Number a leg at a pixel, in place of the numbers at which the pixel was aimed. */
+  number(pin: Pin, replaced: (one: Pin) => boolean): void {
+    const { changed } = this;
+    this.begin();
+    this.changed = changed; // the machine stands where it stood
+    const others = this.numbers.filter((one) => !replaced(one));
+    const again = others.length < this.numbers.length && this.numbers.some((one) => replaced(one) && one.leg === pin.leg);
+    this.numbers = again ? others : [...others, pin];
   }
 
   /** Return to the state before the last change; false without one. */
