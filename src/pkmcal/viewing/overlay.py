@@ -142,7 +142,7 @@ def pin_distances(
         visible = camera.project(points)
         away = np.nan_to_num(np.hypot(*(visible - pin.pixel).T), nan=UNSEEN_JOINT_PIXELS)
         nearest = int(np.argmin(away))
-        tubes = pane.machine.document.legs[pin.leg - 1].tubes if pin.end == "axis" else []
+        tubes = pane.machine.document.legs[pin.leg - 1].tubes if pin.end == "axis" else ()
         spread = np.hypot(tolerance, max((tube.radius for tube in tubes), default=0.0))
         # pixels of the spread, across the line of sight
         shifted = camera.project(points[nearest] + spread * np.eye(3)[0])
