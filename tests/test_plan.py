@@ -424,6 +424,18 @@ def test_a_session_without_places(demo, quick_plans, tmp_path):
     )
 
 
+def test_steps_and_play_of_readings_count_as_noise(planned):
+    """A step is uniformly distributed, play half of it to either side; commands are steps."""
+    coarse = hexapod(joint_noise=3e-6, reading_resolution=1e-4, play=5e-5)
+    sigma = np.sqrt(3e-6**2 + 1e-4**2 / 12 + 5e-5**2 / 4)
+    np.testing.assert_allclose(coarse.rig.joint_noise, sigma, rtol=1e-12)
+    assert len(coarse.words) == len(hexapod().words) + 1  # play is an offset from one side
+    by_steps = small(coarse)
+    steps = by_steps.joints / 1e-4
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    assert by_steps.promised.position > planned.promised.position
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -433,6 +445,7 @@ def test_a_session_without_places(demo, quick_plans, tmp_path):
         (["gough-stewart", "--tracker", "2e-5", "--places", "2"], "no camera whose place"),
         (["gough-stewart", "--edge-noise", "0"], "over 0 to 100"),
         (["gough-stewart", "--joint-noise", "2"], "--joint-noise: this number cannot be used"),
+        (["gough-stewart", "--play", "1 deg"], "--play"),
         (["h4"], "no leg of the nominal model has visible cylinders"),
         (["nothing-like-it"], "nothing-like-it"),
     ],

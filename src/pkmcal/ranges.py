@@ -113,6 +113,8 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
             "corner_noise": Range(0, 100, above=True, default=0.05, unit="px"),
             "tracker": Range(0, 1, above=True),
             "joint_noise": Range(0, 1, above=True, default=GOOD_ENCODER_SIGMA, unit="m or rad"),
+            "reading_resolution": Range(0, 1, default=0.0, unit="m or rad"),
+            "play": Range(0, 1, default=0.0, unit="m or rad"),
             "seed": _SEED,
         },
         "reproduce": {"runs": _whole(2, 100_000, 100), "seed": _SEED},

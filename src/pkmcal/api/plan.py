@@ -75,6 +75,8 @@ def plan(
     edge_noise: float = default("plan", "edge_noise"),
     corner_noise: float = default("plan", "corner_noise"),
     joint_noise: float | str = default("plan", "joint_noise"),
+    reading_resolution: float | str = default("plan", "reading_resolution"),
+    play: float | str = default("plan", "play"),
     seed: int = 0,
     progress: Progress | None = None,
 ) -> PlanResult:
@@ -115,6 +117,9 @@ def plan(
     joint_noise :
         Standard deviation of a reading, m or rad, or a text with its unit, such as "3 um"; machines
         only.
+    reading_resolution, play :
+        Step of the readings, and by how much a drive's positions at one reading differ with the
+        side from which it comes, as ``joint_noise``. They count as noise; machines only.
     seed :
         Seed for all random numbers.
     progress :
@@ -142,9 +147,9 @@ def plan(
     region, where = None, None
     with threadpool_limits(1, "blas"), whole(progress, "Reading the nominal model") as report:
         if isinstance(subject, Session) or folder is not None:
-            _check_options(
-                "a machine", {"--camera": camera, "--board": board, "--tracker": tracker}
-            )
+            of_machines = {"--camera": camera, "--board": board, "--tracker": tracker}
+            steps = {"--reading-resolution": reading_resolution, "--play": play}
+            _check_options("a machine", of_machines | steps)
             session = (
                 subject if isinstance(subject, Session) else load_session_to_plan(folder or "")
             )
@@ -161,8 +166,10 @@ def plan(
                 "a session", {"--after": after, "--same-place": same_place, "--best-of": best_of}
             )
             planned, where = _of_machine(
-                subject, camera, board, bool(places), joint_noise, tracker=tracker,
-                edge=edge_noise, corner=corner_noise, seed=seed,
+                subject, camera, board, bool(places),
+                {"joint_noise": joint_noise, "reading_resolution": reading_resolution,
+                 "play": play},
+                tracker=tracker, edge=edge_noise, corner=corner_noise, seed=seed,
             )  # fmt: skip
         choosing = partial(part(report, begin, 1), "Choosing configurations")
         try:
@@ -181,18 +188,21 @@ def _of_machine(
     camera: Camera | Path | str | tuple[int, int] | None,
     board: bool,
     places: bool,
-    joint_noise: float | str,
+    readings: Mapping[str, float | str],
     **noise: Any,
 ) -> tuple[Subject, str]:
     """Machine with an assumed camera, and the location of its errors: the camera's or the machine's
     name as given.
 
-    places : whether stations are chosen. joint_noise, noise : of readings; of edges, corners and
-    the tracker.
+    places : whether stations are chosen. readings : their noise, resolution and play, by the names
+    of the options. noise : of edges, corners and the tracker.
     """
     machine = subject if isinstance(subject, Machine) else load_mechanism(str(subject))
-    reading = in_joint_units(joint_noise, "m or rad", machine.joint_units, "--joint-noise")
-    check_number("plan", "joint_noise", reading)
+    numbers = {}
+    for option, value in readings.items():
+        where = f"--{option.replace('_', '-')}"
+        numbers[option] = in_joint_units(value, "m or rad", machine.joint_units, where)
+        check_number("plan", option, numbers[option])
     name = machine.name if isinstance(subject, Machine) else str(subject)
     if camera is None or isinstance(camera, tuple):
         eye = camera_of_size(camera or PLANNED_IMAGE_SIZE)
@@ -205,7 +215,7 @@ def _of_machine(
             [eye] * (1 if one else STATIONS_AROUND_A_MACHINE),
             machine.joint_names,
             board=board_for(machine, "platform") if board else None,
-            joint_noise=reading,
+            **numbers,
             **noise,
         )
     except InputError as error:

@@ -80,6 +80,13 @@ FOR_A_SESSION, FOR_A_MACHINE = "For a SESSION", "For a MACHINE"
     number(
         "plan", "joint_noise", "M", "Sigma of a joint reading.", group=FOR_A_MACHINE
     ),
+    number(
+        "plan", "reading_resolution", "M", "Step of the joint readings.", group=FOR_A_MACHINE
+    ),
+    number(
+        "plan", "play", "M", "Play: by how much a drive's positions at one reading differ with the"
+        " side from which it comes.", group=FOR_A_MACHINE
+    ),
     out("SESSION/plan, or plan"),
     as_json(),
 )  # fmt: skip

@@ -6,6 +6,7 @@ One row a limb, ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened. Closur
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, final
 
@@ -19,6 +20,13 @@ PERFECT_CLOSURE_SIGMA = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. It is a third
 of a good encoder's noise, so that no information is lost, and large enough for the conditioning of
 the normal equations."""
+
+
+def reading_sigma(noise: float, resolution: float, play: float) -> float:
+    """Standard deviation of a reading, m or rad: of noise, of a step that is uniformly distributed,
+    and of half of the play to either side.
+    """
+    return math.hypot(noise, resolution / 12**0.5, play / 2)
 
 
 @final

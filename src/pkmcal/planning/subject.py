@@ -31,6 +31,7 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.start import start_mounts
 from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements import BOARD_MOUNT_NAME, SHADING_SIGMA, Mount
+from pkmcal.measurements.readings import reading_sigma
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import first_binning
 from pkmcal.observe.predict import tubes_of
@@ -53,7 +54,7 @@ from pkmcal.planning.rig import (
 from pkmcal.session.load import Session, Station
 from pkmcal.session.readings import rounding_step
 from pkmcal.simulation.board import place_board
-from pkmcal.wording import brief
+from pkmcal.wording import amount, brief
 
 PLAN_IMAGES_A_STATION = 12
 """Maximum number of a station's images whose edges are measured; twice as many of all stations
@@ -61,6 +62,10 @@ together. A plan is made once, and few edges determine the shading badly.
 """
 FINEST_STEP = 1e-6
 """m or rad, step of a reading below which no drive moves."""
+PLAY_IS_AN_OFFSET = (
+    "Play counts as noise here, but it is an offset where a drive always comes from the same side:"
+    " approach every configuration so, and the result is better than this."
+)
 
 
 @dataclass(frozen=True)
@@ -166,6 +171,8 @@ def of_machine(
     board: Board | None = None,
     tracker: tuple[float, float | None] | None = None,
     joint_noise: float = UNTOLD_READING_NOISE,
+    reading_resolution: float = 0.0,
+    play: float = 0.0,
     edge: float = NOMINAL_EDGE_SIGMA,
     corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
@@ -176,13 +183,20 @@ def of_machine(
     board : on the platform, observed instead of the legs.
     tracker : standard deviations of its positions (m) and turns (rad; None if it measures points),
         instead of cameras.
+    joint_noise, reading_resolution, play : standard deviation of a reading, its step, and by how
+        much a drive's positions at one reading differ with the side from which it comes, m or rad.
     edge, corner : standard deviations, px.
     """
     rng = np.random.default_rng(seed)
-    noise = f"Readings are taken to be good to {brief(joint_noise * 1e6)} µm (or µrad)"
+    sigma = reading_sigma(joint_noise, reading_resolution, play)
+    same_side = (PLAY_IS_AN_OFFSET,) if play else ()
+    steps = np.full(machine.n_joints, reading_resolution)
+    good_to = " or ".join(amount(sigma, unit) for unit in dict.fromkeys(machine.joint_units))
+    noise = f"Readings are taken to be good to {good_to}"
     if tracker is not None:
-        rig = _tracker_rig(machine, tracker, joint_noise)
-        return Subject(rig, None, tuple(columns), (), (noise + ", as stated.",))
+        rig = _tracker_rig(machine, tracker, sigma)
+        words = (noise + ", as stated.", *same_side)
+        return Subject(rig, None, tuple(columns), (), words, steps=steps)
     # Stations at default poses, which observe legs or a board.
     cameras = tuple(cameras)
     stations = default_stations(machine, cameras, rng, "platform" if board else None)
@@ -210,15 +224,15 @@ def of_machine(
         tuple(f"station{k + 1}" for k in range(len(cameras))),
         T_camera_base,
         numbered(map(id, cameras)),
-        joint_noise,
+        sigma,
         instruments,
         mounts,
         T_mount,
         where=None,
     )
     fields = board.document if board else None
-    words = (f"{noise}, {what}: an assumption.",)
-    return Subject(rig, None, tuple(columns), (), words, fields)
+    words = (f"{noise}, {what}: an assumption.", *same_side)
+    return Subject(rig, None, tuple(columns), (), words, fields, steps=steps)
 
 
 def _best_board_pose(

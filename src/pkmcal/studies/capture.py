@@ -9,7 +9,6 @@ machine's shorter leg still has its planned length.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,6 +26,7 @@ from pkmcal.measurements import (
     PoseSet,
     concatenate,
 )
+from pkmcal.measurements.readings import reading_sigma
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
 from pkmcal.placement.configurations import draw_configurations
@@ -100,10 +100,8 @@ class Design:
 
     @property
     def reading_sigma(self) -> float:
-        """Standard deviation of a reading that a session states, m or rad: of noise, of a step that
-        is uniformly distributed, and of half of the play to either side.
-        """
-        return math.hypot(self.reading_noise, self.reading_resolution / 12**0.5, self.play / 2)
+        """Standard deviation of a reading that a session states, m or rad."""
+        return reading_sigma(self.reading_noise, self.reading_resolution, self.play)
 
     def readings(self, joints: Array, rng: np.random.Generator) -> Array:
         """Readings of drives that are at ``joints`` (..., K, m), in their order.
