@@ -14,7 +14,13 @@ from pkmcal.geometry.rigid import cross, dot, inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.joints import Equation, equations
-from pkmcal.mechanisms.kinematics import forward, inverse_result, on_manifold
+from pkmcal.mechanisms.kinematics import (
+    closure_at,
+    forward,
+    inverse_result,
+    on_manifold,
+    undriven,
+)
 
 SAME_HINGE_DIFFERENCE = 1e-9
 """Tolerance, m and rad, between a common axis or hinge of two legs: rounding."""
@@ -121,9 +127,10 @@ def home_state(machine: Machine) -> HomeState:
     reached = bool(np.isfinite(readings).all())
     fk = forward(layout, values, readings, near, internal) if reached else None
     if fk is None or not bool(fk.converged):
+        gap = float(np.abs(undriven(closure_at(layout, values, machine.home()))[0]).max(initial=0))
         raise GeometryError(
-            f"mechanism {machine.name!r} does not close at its home pose",
-            found="no readings" if fk is None else f"a gap of {float(fk.error) * 1e3:.3g} mm",
+            f"mechanism {machine.name!r} does not close at its home pose, and at none near it",
+            found=f"a gap of {gap * 1e3:.3g} mm at home" if np.isfinite(gap) else "no readings",
             expected="a pose that all legs reach",
             next_step="give home: {position: [x, y, z]} in the mechanism file",
             code="mechanism.home_not_closed",
