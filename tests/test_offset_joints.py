@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+import pkmcal
 from export_sources import source_of
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.cameras.pinhole import Pinhole
@@ -175,7 +176,17 @@ def test_the_file_has_the_offsets(machine, tmp_path):
     np.testing.assert_allclose(load_mechanism(path).inverse(poses), readings, atol=1e-12)
 
 
-@pytest.mark.parametrize(("to", "noted"), [("c", True), ("mujoco", True), ("yaml", False)])
+@pytest.mark.parametrize(
+    ("to", "noted"),
+    [
+        ("c", True),
+        ("linuxcnc", True),
+        ("mujoco", False),
+        ("urdf", False),
+        ("sdf", False),
+        ("yaml", False),
+    ],
+)
 def test_a_format_with_one_centre_is_noted(to, noted, tmp_path):
     nominal = load_mechanism(hexapod(tmp_path, *OFFSETS["both"]))
     notes = make_export(source_of(nominal), to).notes
@@ -185,6 +196,22 @@ def test_a_format_with_one_centre_is_noted(to, noted, tmp_path):
         # less than the offsets, for the rods' offsets take their mean
         assert 1e-5 < note.facts["largest"] < 2e-3
         assert note.level is Level.DOUBTFUL
+
+
+@pytest.mark.parametrize("to", ["mujoco", "urdf", "sdf"])
+def test_models_of_bodies_are_read_back_with_the_offsets(machine, to, tmp_path):
+    files = make_export(source_of(machine), to).files
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    again = pkmcal.new(from_file=tmp_path / next(iter(files))).texts["mechanism.yaml"]
+    (tmp_path / "again.yaml").write_text(again)
+    read = load_mechanism(tmp_path / "again.yaml")
+    for leg, other in zip(read.to_document()["legs"], machine.to_document()["legs"], strict=True):
+        for end in ("base", "platform"):
+            offsets = (one[end].get("offset", 0.0) for one in (leg, other))
+            assert next(offsets) == pytest.approx(next(offsets), abs=1e-12)
+    poses, readings = samples(machine, 20)
+    np.testing.assert_allclose(read.inverse(poses), readings, atol=1e-12)
 
 
 def test_calibration_knows_the_offsets(tmp_path):

@@ -27,6 +27,8 @@ JOINT_BODY = " joint"
 """End of the names of bodies that readers add where a joint is beside its body's origin."""
 DISPLAY_MARK = "_display"
 """Part of the names of cylinders that exports add for display, with radii of no tube."""
+BASE_CROSS, PLATFORM_CROSS = "_base_cross", "_platform_cross"
+"""Ends of the names of the bodies between the two axes of a universal joint that do not meet."""
 NO_LIMITS = np.full(2, np.nan)
 MOST_CLOSING_STEPS = 30
 LARGEST_CLOSING_STEP = 0.3
