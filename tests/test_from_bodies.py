@@ -367,6 +367,15 @@ REFUSED = {
 }  # fmt: skip
 
 
+def test_a_template_is_greeted_as_one(tmp_path):
+    path = tmp_path / "model.sdf"
+    path.write_text("<?xml version='1.0'?>\n<%\n  R = 1.0\n%>\n<sdf version='1.4'/>\n")
+    with pytest.raises(InputError) as error:
+        read(path, tmp_path)
+    assert "<%" in error.value.found
+    assert error.value.next_step
+
+
 def test_a_universal_joint_with_offset_axes_is_read(tmp_path):
     root = changed(mjcf, ".//body[@name='frame']/body/joint[2]", pos="0 0 -0.097")
     machine, _ = read(written(root, tmp_path), tmp_path)
