@@ -374,7 +374,8 @@ def test_mistakes_in_readings_of_four_cables_are_named(what, tmp_path):
             calibrate_session(tmp_path / f"{seed}")
         assert error.value.code == f"readings.{what}"
         if what == "exchanged":
-            assert f"leg{one + 1}" in str(error.value) and f"leg{other + 1}" in str(error.value)
+            assert f"leg{one + 1}" in str(error.value)
+            assert f"leg{other + 1}" in str(error.value)
 
 
 def test_lengths_at_measured_poses_determine_each_leg(tmp_path):

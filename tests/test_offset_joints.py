@@ -20,8 +20,9 @@ from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
 from pkmcal.mechanisms.joints import offset_rows, rod_shifts
 from pkmcal.outcome.finding import Level
-from pkmcal.studies.calibrations import SimulatedCalibrations
+from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY, SimulatedCalibrations
 from pkmcal.studies.capture import Design
+from pkmcal.studies.engine import run
 from pkmcal.studies.tasks import Batch
 from screw_hexapod import screw_hexapod
 from test_cables import small_steps
@@ -147,6 +148,18 @@ def test_a_leg_parallel_to_an_axis_that_counts_for_nothing(tmp_path):
     up = np.array([0.0, 0.0, 0.4])
     rows = offset_rows(nominal.layout.offsets, nominal.values, np.eye(3), np.tile(up, (6, 1)))
     assert all(np.isfinite(part).all() for part in rows)
+
+
+def test_deviations_stated_from_images_hold(tmp_path):
+    """Twelve calibrations by the edges of machines with errors of their prior sigmas."""
+    camera = Pinhole((1280, 960), np.array([900.0, 900.0, 639.5, 479.5, 0, 0, 0, 0, 0]))
+    (tmp_path / "m.yaml").write_text(yaml_text(offset_fields(*OFFSETS["both"], tubes=True)))
+    machine = load_mechanism(tmp_path / "m.yaml")
+    design = Design(machine, (camera,), stations=2, configurations=10)
+    sample = run(SimulatedCalibrations(design), 12, 0).samples[JOINT_ESTIMATE_KEY]
+    for name in ("parameters", "tool"):
+        ratio = sample.values[name] / sample.sigma[name]
+        assert 0.7 < np.sqrt(np.nanmean(ratio**2)) < 1.4, name
 
 
 @pytest.mark.parametrize("offsets", OFFSETS)
