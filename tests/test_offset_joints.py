@@ -24,28 +24,13 @@ from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY, SimulatedCalibration
 from pkmcal.studies.capture import Design
 from pkmcal.studies.engine import run
 from pkmcal.studies.tasks import Batch
-from screw_hexapod import screw_hexapod
+from screw_hexapod import offset_fields
 from test_cables import small_steps
 from test_identify_residuals import check
 from test_kinematics import differences
 from test_pose_sessions import make, write_joints
 
 OFFSETS = {"both": (0.012, 0.009), "base": (0.012, None), "platform": (None, -0.01)}
-
-
-def offset_fields(base, platform, tubes=False):
-    """Fields of a hexapod whose joints' second axes lie at offsets, m, from their first ones."""
-    fields = screw_hexapod(0.0).to_document()
-    for leg in fields["legs"]:
-        del leg["length"]["lead"]
-        for end, offset in (("base", base), ("platform", platform)):
-            if offset is None:
-                del leg[end]["axis"]
-            else:
-                leg[end]["offset"] = offset
-        if not tubes:
-            leg["tubes"] = []
-    return fields
 
 
 def hexapod(folder, *offsets):
