@@ -1,4 +1,4 @@
-"""Hexapods of ball screws whose ends turn with universal joints (6-UPU), whose axes may not meet."""
+"""Hexapods of ball screws that turn with universal joints (6-UPU), whose axes may not meet."""
 
 from __future__ import annotations
 
