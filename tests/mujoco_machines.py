@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkmcal.files import parse_yaml, validated_document
+from pkmcal.files import parse_yaml, validated_document, yaml_text
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import (
     MechanismDocument,
@@ -18,6 +18,7 @@ from pkmcal.mechanisms import (
     load_mechanism,
     machine_from_document,
 )
+from screw_hexapod import offset_fields
 
 LOUD = "NO MUJOCO: exported models were not loaded in it (pip install mujoco)"
 CATALOGUE = sorted(catalogue())
@@ -103,6 +104,8 @@ legs:
 home: {position: [0.0, 0.0, 0.15]}
 """,
 }
+MADE["offset axes"] = yaml_text(offset_fields(0.012, -0.009, tubes=True))
+MADE["offset base"] = yaml_text(offset_fields(0.012, None, tubes=True))
 TURNED = {
     "turned h4": ("h4", "[0.0, 0.0, -0.45]", "[0, 0, 0.3]"),
     "tilted delta": ("delta", "[0.01, 0.0, -0.22]", "[0.1, -0.1, 0.2]"),

@@ -1,4 +1,4 @@
-"""A hexapod of ball screws whose ends turn with universal joints (6-UPU)."""
+"""Hexapods of ball screws that turn with universal joints (6-UPU), whose axes may not meet."""
 
 from __future__ import annotations
 
@@ -35,3 +35,18 @@ def screw_hexapod(lead=LEAD, turned=1.0):
     return machine_from_document(
         MechanismDocument.model_validate(dict(document.model_copy(update=update)))
     )
+
+
+def offset_fields(base, platform, tubes=False):
+    """Fields of a hexapod whose joints' second axes lie at offsets, m, from their first ones."""
+    fields = screw_hexapod(0.0).to_document()
+    for leg in fields["legs"]:
+        del leg["length"]["lead"]
+        for end, offset in (("base", base), ("platform", platform)):
+            if offset is None:
+                del leg[end]["axis"]
+            else:
+                leg[end]["offset"] = offset
+        if not tubes:
+            leg["tubes"] = []
+    return fields

@@ -15,6 +15,7 @@ from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import parse_yaml, yaml_text
 from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
+from pkmcal.identify.length_registration import register_by_lengths
 from pkmcal.identify.tool import platform_sigma
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.pulley import Pulley, Spool
@@ -354,6 +355,40 @@ def test_a_wrong_reading_of_four_cables_is_reported(tmp_path, seed):
     assert {"readings.single", "readings.outvoted"} & set(
         calibrate_session(tmp_path / "s").verdict.codes
     )
+
+
+@pytest.mark.parametrize("what", ["exchanged", "shifted"])
+def test_mistakes_in_readings_of_four_cables_are_named(what, tmp_path):
+    """No pose follows from the readings: hypotheses are compared at the measured poses. Anchors at
+    the corners of a rectangle look alike in a mirror, so an exchange of the two others is a rival.
+    """
+    for seed in range(8):
+        _, readings, _ = four_cables(tmp_path / f"{seed}", seed)
+        wrong = np.roll(readings, 1, axis=0)
+        if what == "exchanged":
+            one, other = np.random.default_rng(seed).choice(4, 2, replace=False)
+            wrong = readings.copy()
+            wrong[:, [one, other]] = readings[:, [other, one]]
+        table("joints", "leg1,leg2,leg3,leg4", wrong, tmp_path / f"{seed}")
+        with pytest.raises(InputError) as error:
+            calibrate_session(tmp_path / f"{seed}")
+        assert error.value.code == f"readings.{what}"
+        if what == "exchanged":
+            assert f"leg{one + 1}" in str(error.value)
+            assert f"leg{other + 1}" in str(error.value)
+
+
+def test_lengths_at_measured_poses_determine_each_leg(tmp_path):
+    """Exact lengths of another machine than the nominal one, in frames that nobody knows."""
+    poses, _, _ = four_cables(tmp_path / "s", 0)
+    machine = pkmcal.load_session(tmp_path / "s").machine
+    camera = pose(rotation(np.array([0.3, -2.0, 1.0])), np.array([0.5, -4.0, 1.0]))
+    mount = pose(rotation(np.array([1.0, 0.2, 0.4])), np.array([0.1, 0.0, -0.2]))
+    observed, whiten = camera @ poses @ mount, np.tile(np.eye(6), (len(poses), 1, 1))
+    found = register_by_lengths(machine, machine.inverse(poses)[None], observed[None], whiten, 1e-4)
+    np.testing.assert_allclose(found.T_camera_base[0], camera, atol=1e-9)
+    np.testing.assert_allclose(found.T_mount[0], mount, atol=1e-9)
+    assert found.squares.max() < 1e-9
 
 
 def off_by(frames, machine, poses, true):

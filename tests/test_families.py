@@ -242,6 +242,8 @@ def test_home_is_where_legs_have_the_length(hexapod, tmp_path):
             "h.hal, line 2, genhexkins.base.0.x",
         ),
         ("genhexkins", "trivkins", "h.hal"),
+        ("genhexkins.base.0.x", "genhexkins.bsae.0.x", "h.hal, line 2"),
+        ("genhexkins.base.0.x", "genhexkins.base.6.x", "h.hal, line 2"),
     ],
 )
 def test_incomplete_pins_are_refused(old, new, where, hexapod, tmp_path):
@@ -260,6 +262,8 @@ def test_incomplete_pins_are_refused(old, new, where, hexapod, tmp_path):
         ("\n1,", "\n1,,", "h.csv, line 2"),
         ("\n1,1", "\n1,x1", "h.csv, line 2, base_x"),
         (" [mm]", "", "h.csv, leg 1, base_x"),
+        ("\n3,", "\n2,", "h.csv, line 4, leg"),
+        (",", ";", "h.csv, line 1"),
     ],
 )
 def test_wrong_tables_are_refused(old, new, where, hexapod, tmp_path):

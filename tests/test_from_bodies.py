@@ -339,8 +339,11 @@ def with_text(make, path, text):
 
 
 REFUSED = {
-    "offset axes": (
-        lambda: changed(mjcf, ".//body[@name='frame']/body/joint[2]", pos="0 0 -0.103"), "mm"
+    "axes that are neither square nor meet": (
+        lambda: changed(
+            mjcf, ".//body[@name='frame']/body/joint[2]", pos="0 0 -0.103", axis="1 5 0"
+        ),
+        "mm",
     ),
     "a slide beside the leg": (
         lambda: changed(mjcf, ".//joint[@name='slide0']", axis="0 0.1 1"), "deg"
@@ -362,6 +365,23 @@ REFUSED = {
     ),
     "no such link": (lambda: with_text(sdf, ".//joint/parent", "nobody"), "nobody"),
 }  # fmt: skip
+
+
+def test_a_template_is_greeted_as_one(tmp_path):
+    path = tmp_path / "model.sdf"
+    path.write_text("<?xml version='1.0'?>\n<%\n  R = 1.0\n%>\n<sdf version='1.4'/>\n")
+    with pytest.raises(InputError) as error:
+        read(path, tmp_path)
+    assert "<%" in error.value.found
+    assert error.value.next_step
+
+
+def test_a_universal_joint_with_offset_axes_is_read(tmp_path):
+    root = changed(mjcf, ".//body[@name='frame']/body/joint[2]", pos="0 0 -0.097")
+    machine, _ = read(written(root, tmp_path), tmp_path)
+    offsets = [leg["base"].get("offset") for leg in machine.to_document()["legs"]]
+    (stated,) = [offset for offset in offsets if offset is not None]
+    assert stated == pytest.approx(0.003, abs=1e-6)
 
 
 @pytest.mark.parametrize("what", REFUSED)

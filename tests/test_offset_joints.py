@@ -7,36 +7,30 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+import pkmcal
 from export_sources import source_of
 from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
 from pkmcal.exporters.samples import samples
 from pkmcal.files import yaml_text
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import load_mechanism, mechanism_text
-from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.mechanisms.closure import closure, dense, limb_ends
+from pkmcal.mechanisms.joints import offset_rows, rod_shifts
 from pkmcal.outcome.finding import Level
-from screw_hexapod import screw_hexapod
+from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY, SimulatedCalibrations
+from pkmcal.studies.capture import Design
+from pkmcal.studies.engine import run
+from pkmcal.studies.tasks import Batch
+from screw_hexapod import offset_fields
+from test_cables import small_steps
+from test_identify_residuals import check
 from test_kinematics import differences
 from test_pose_sessions import make, write_joints
 
 OFFSETS = {"both": (0.012, 0.009), "base": (0.012, None), "platform": (None, -0.01)}
-
-
-def offset_fields(base, platform, tubes=False):
-    """Fields of a hexapod whose joints' second axes lie at offsets, m, from their first ones."""
-    fields = screw_hexapod(0.0).to_document()
-    for leg in fields["legs"]:
-        del leg["length"]["lead"]
-        for end, offset in (("base", base), ("platform", platform)):
-            if offset is None:
-                del leg[end]["axis"]
-            else:
-                leg[end]["offset"] = offset
-        if not tubes:
-            leg["tubes"] = []
-    return fields
 
 
 def hexapod(folder, *offsets):
@@ -54,8 +48,8 @@ def machine(request, tmp_path):
 
 
 def rod_between(T, leg):
-    """Length of a leg's rod, m, by the angles of both joints: the second axis of each turns about
-    its first one, and the rod is square to both second axes.
+    """Ends of a leg's rod, m, by the angles of both joints: the second axis of each turns about its
+    first one, and the rod is square to both second axes.
     """
     bodies = {"base": (np.eye(3), np.zeros(3)), "platform": (T[:3, :3], T[:3, 3])}
     joints = []
@@ -79,16 +73,19 @@ def rod_between(T, leg):
 
     solved = least_squares(slant, [0.0, 0.0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
     (a, _), (b, _) = ends(solved.x)
-    return np.linalg.norm(b - a)
+    return a, b
 
 
 def test_readings_are_those_of_rods_square_to_both_axes(machine):
     document = machine.to_document()
     shares = []
     for T, readings in zip(*samples(machine, 8), strict=True):
-        for leg, reading in zip(document["legs"], readings, strict=True):
+        rods = np.stack(machine.ends_at(readings, T).rods)
+        for j, (leg, reading) in enumerate(zip(document["legs"], readings, strict=True)):
+            start, stop = rod_between(T, leg)
             length = leg["scale"] * reading + leg["length"]["offset"]
-            assert length == pytest.approx(rod_between(T, leg), abs=1e-12)
+            assert length == pytest.approx(np.linalg.norm(stop - start), abs=1e-12)
+            np.testing.assert_allclose(rods[:, j], [start, stop], atol=1e-12)
             a, b = (np.array(leg[end]["center"]) for end in ("base", "platform"))
             shares.append(length - np.linalg.norm(T[:3, :3] @ b + T[:3, 3] - a))
     assert np.ptp(shares) > 1e-4  # no mere change of the rods' offsets
@@ -106,6 +103,62 @@ def test_derivatives(machine, k):
     np.testing.assert_allclose(dense(c, count), by_theta, atol=1e-10)
 
 
+def test_derivatives_of_the_rods_ends(machine):
+    layout, theta = machine.layout, machine.values
+    T, q = (values[1] for values in samples(machine, 3))
+    shifts = limb_ends(layout, theta, q, T).shifts
+    line = limb_ends(layout, theta, q, T).platform.b - machine.base_centers()
+
+    def moved(theta=theta, T=T, line=line):
+        return rod_shifts(layout.offsets, theta, T[..., :3, :3], line).value
+
+    count = layout.n_legs
+    for leg in range(count):
+        of_leg = np.arange(count)[:, None] == leg
+        by_line = differences(lambda d, at=of_leg: moved(line=line + at * d[:, None]), 3, 1e-3)
+        np.testing.assert_allclose(shifts.by_line[leg], by_line[leg], atol=1e-10)
+    by_turn = differences(lambda d: moved(T=perturb(T, np.pad(d, ((0, 0), (0, 3))))), 3, 1e-3)
+    np.testing.assert_allclose(shifts.by_turn, by_turn, atol=1e-10)
+    by_theta = differences(lambda d: moved(theta + d), len(theta), 1e-3)
+    by_axes = np.concatenate([shifts.by_base_axis, shifts.by_platform_axis], axis=-1)
+    dense_axes = np.zeros((*by_axes.shape[:-1], len(theta) + 1))
+    for leg, index in enumerate(layout.offset_axes):
+        dense_axes[leg][..., index] = by_axes[leg]
+    np.testing.assert_allclose(dense_axes[..., :-1], by_theta, atol=1e-10)
+
+
+def test_a_leg_parallel_to_an_axis_that_counts_for_nothing(tmp_path):
+    """The base joint's axes meet, whatever the direction of the leg."""
+    nominal = load_mechanism(hexapod(tmp_path, None, 0.01))
+    up = np.array([0.0, 0.0, 0.4])
+    rows = offset_rows(nominal.layout.offsets, nominal.values, np.eye(3), np.tile(up, (6, 1)))
+    assert all(np.isfinite(part).all() for part in rows)
+
+
+def test_deviations_stated_from_images_hold(tmp_path):
+    """Twelve calibrations by the edges of machines with errors of their prior sigmas."""
+    camera = Pinhole((1280, 960), np.array([900.0, 900.0, 639.5, 479.5, 0, 0, 0, 0, 0]))
+    (tmp_path / "m.yaml").write_text(yaml_text(offset_fields(*OFFSETS["both"], tubes=True)))
+    machine = load_mechanism(tmp_path / "m.yaml")
+    design = Design(machine, (camera,), stations=2, configurations=10)
+    sample = run(SimulatedCalibrations(design), 12, 0).samples[JOINT_ESTIMATE_KEY]
+    for name in ("parameters", "tool"):
+        ratio = sample.values[name] / sample.sigma[name]
+        assert 0.7 < np.sqrt(np.nanmean(ratio**2)) < 1.4, name
+
+
+@pytest.mark.parametrize("offsets", OFFSETS)
+def test_derivatives_of_the_edges(offsets, tmp_path):
+    """The rod's ends move on second axes with the platform and with both first axes."""
+    camera = Pinhole((1280, 960), np.array([900.0, 900.0, 639.5, 479.5, 0, 0, 0, 0, 0]))
+    (tmp_path / "m.yaml").write_text(yaml_text(offset_fields(*OFFSETS[offsets], tubes=True)))
+    machine = load_mechanism(tmp_path / "m.yaml")
+    design = Design(machine, (camera,), stations=2, configurations=4)
+    data = SimulatedCalibrations(design).draw(Batch("machine", 2, np.random.SeedSequence(0)))
+    problem, rng = data.assembled.problem, np.random.default_rng(3)
+    check(problem, problem.retract(data.start, *small_steps(problem, data.start, rng)), rng)
+
+
 def test_poses_come_back(machine):
     poses, readings = samples(machine, 20)
     near = perturb(poses, 0.02 * np.random.default_rng(2).normal(size=(len(poses), 6)))
@@ -121,7 +174,17 @@ def test_the_file_has_the_offsets(machine, tmp_path):
     np.testing.assert_allclose(load_mechanism(path).inverse(poses), readings, atol=1e-12)
 
 
-@pytest.mark.parametrize(("to", "noted"), [("c", True), ("mujoco", True), ("yaml", False)])
+@pytest.mark.parametrize(
+    ("to", "noted"),
+    [
+        ("c", True),
+        ("linuxcnc", True),
+        ("mujoco", False),
+        ("urdf", False),
+        ("sdf", False),
+        ("yaml", False),
+    ],
+)
 def test_a_format_with_one_centre_is_noted(to, noted, tmp_path):
     nominal = load_mechanism(hexapod(tmp_path, *OFFSETS["both"]))
     notes = make_export(source_of(nominal), to).notes
@@ -131,6 +194,22 @@ def test_a_format_with_one_centre_is_noted(to, noted, tmp_path):
         # less than the offsets, for the rods' offsets take their mean
         assert 1e-5 < note.facts["largest"] < 2e-3
         assert note.level is Level.DOUBTFUL
+
+
+@pytest.mark.parametrize("to", ["mujoco", "urdf", "sdf"])
+def test_models_of_bodies_are_read_back_with_the_offsets(machine, to, tmp_path):
+    files = make_export(source_of(machine), to).files
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    again = pkmcal.new(from_file=tmp_path / next(iter(files))).texts["mechanism.yaml"]
+    (tmp_path / "again.yaml").write_text(again)
+    read = load_mechanism(tmp_path / "again.yaml")
+    for leg, other in zip(read.to_document()["legs"], machine.to_document()["legs"], strict=True):
+        for end in ("base", "platform"):
+            offsets = (one[end].get("offset", 0.0) for one in (leg, other))
+            assert next(offsets) == pytest.approx(next(offsets), abs=1e-12)
+    poses, readings = samples(machine, 20)
+    np.testing.assert_allclose(read.inverse(poses), readings, atol=1e-12)
 
 
 def test_calibration_knows_the_offsets(tmp_path):
@@ -159,7 +238,6 @@ def test_calibration_knows_the_offsets(tmp_path):
         (lambda leg: leg["base"].pop("axis"), "legs[2].base.offset"),
         (lambda leg: leg["length"].update(lead=0.005), "legs[2].length.lead"),
         (lambda leg: leg["base"].update(offset=0.3), "legs[2]"),  # half of the leg
-        (lambda leg: leg.update(tubes=[{"radius": 0.01, "from": 0.1, "to": 0.2}]), "legs[2].tubes"),
     ],
 )
 def test_what_offset_joints_exclude_is_refused(change, field, tmp_path):

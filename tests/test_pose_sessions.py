@@ -501,6 +501,27 @@ def test_a_factor_of_one_kind_of_part_is_no_scale_of_the_machine():
     assert scale(np.where(lengths, 1.05, 1.0) * table.nominal) == pytest.approx(1.05, rel=1e-6)
 
 
+def test_errors_of_the_joints_that_define_the_frame_are_no_scale():
+    """A four-belt machine whose anchors are off by ordinary errors, in frames by two of them."""
+    machine = load_mechanism("four-belt")
+    table, rng = machine.parameters, np.random.default_rng(0)
+    index = [[table.index(f"legs[{leg}].base.center.{c}") for c in "xy"] for leg in (1, 2, 3, 4)]
+    nominal, covariance = table.nominal[index], np.zeros((len(table), len(table)))
+    places = np.array(index).ravel()
+    free = np.delete(places, [0, 1, 3])  # the first is the origin, the second on the x axis
+    covariance[free, free] = 1.0
+    named = 0
+    for _ in range(2000):
+        off = nominal + table.tolerance[index] * rng.normal(size=(4, 2)) - nominal[0]
+        off -= off[0]
+        x = off[1] / np.linalg.norm(off[1])
+        values = table.nominal.copy()
+        values[index] = nominal[0] + off @ np.array([x, [-x[1], x[0]]]).T
+        estimate = SimpleNamespace(machine=machine.with_values(values), covariance=covariance)
+        named += wrong_scale(estimate) != 1.0
+    assert named <= 8
+
+
 def test_check_reports_how_the_platform_turns(folder):
     made = make(folder, "h4", n=20)
     check = check_session(folder)

@@ -334,7 +334,7 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
     edges, machine, state = measurements.edges, estimate.machine, estimate.state
     ends = machine.ends_at(measurements.joints, state.T_base_platform)
     T = state.T_camera_base[edges.station]
-    a, b = (apply(T, x[edges.configuration, edges.leg]) for x in (ends.a, ends.b))
+    a, b = (apply(T, x[edges.configuration, edges.leg]) for x in ends.rods)
     u = line_through(a, b)[0]
     part = np.linspace(0, 1, DISCREPANCY_BASIS.points_along_edge)
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * part

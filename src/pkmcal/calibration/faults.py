@@ -17,6 +17,7 @@ from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, Purpose
+from pkmcal.identify.gauge import move_generators
 from pkmcal.identify.start import start_state
 from pkmcal.identify.verdict import VERDICT, RicherModel
 from pkmcal.levels import MAJORITY, NEGLIGIBLE, NOISE_EXCESS, OUTLIER_SIGMAS
@@ -36,6 +37,7 @@ from pkmcal.outcome.hypotheses import (
 )
 from pkmcal.session.load import Session
 from pkmcal.session.readings import rounding_step
+from pkmcal.solver.ranks import nonzero
 from pkmcal.wording import listed
 
 WRONG_MODEL_READING_SCALE = 100.0
@@ -55,20 +57,26 @@ def wrong_scale(estimate: Estimate) -> float:
     table = machine.parameters
     length = np.array([unit == "m" and kind != "radius" for unit, kind in zip(
         table.units, table.kinds, strict=True)])  # fmt: skip
-    shifted = length & (np.diag(estimate.covariance) > 0)
-    new, old = machine.values[shifted], table.nominal[shifted]
-    weight = 1 / table.tolerance[shifted] ** 2
-    if not np.any(new):
+    shifted = length & np.any(table.free_matrix() != 0, axis=1)
+    tolerance = table.tolerance[shifted]
+    new, old = machine.values[shifted] / tolerance, table.nominal[shifted] / tolerance
+    # frames are conventions: errors of the joints that define them are in all other differences
+    moves = move_generators(machine.layout, table.nominal)[shifted] / tolerance[:, None]
+    u, s, _ = np.linalg.svd(moves, full_matrices=False)
+    u = u[:, nonzero(s)]
+    new, old = (x - u @ (u.T @ x) for x in (new, old))
+    count = new.size - u.shape[1]
+    if count < 1 or not new.any():
         return 1.0
-    back = float(np.sum(weight * new * old) / np.sum(weight * new**2))
-    null, misfit = (np.sqrt(np.mean(weight * (x - old) ** 2)) for x in (new, back * new))
+    back = float(new @ old) / float(new @ new)
+    null, misfit = (np.linalg.norm(x - old) / np.sqrt(count) for x in (new, back * new))
 
     def ratios(hypotheses: Sequence[Hypothesis[float]]) -> Array:
-        values = log_likelihood(np.array([null, misfit]), new.size)
+        values = log_likelihood(np.array([null, misfit]), count)
         return np.repeat(values[1] - values[0], len(hypotheses))
 
     factor = Hypothesis[float](
-        "machine.scale", "all lengths", lambda x: x * back, parameter_cost(1, new.size)
+        "machine.scale", "all lengths", lambda x: x * back, parameter_cost(1, count)
     )
     best = decide(posterior([factor], [EvidenceLevel("lengths", ratios)]))
     explained = null**2 - misfit**2

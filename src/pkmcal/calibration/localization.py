@@ -116,6 +116,8 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
         fk = session.forward
     except GeometryError as error:  # the nominal model is the user's: it is at fault
         raise error.as_input(session.document["mechanism"]) from None
+    if session.machine.layout.underdetermined:  # every pose is measured
+        return fk.T_base_platform
     # near the ends of its workspace a nominal model within its prior sigmas may not close
     near = fk.error < _allowed_leg_miss(session.machine, fk)
     if near.all() or (most and near.mean() > MAJORITY):

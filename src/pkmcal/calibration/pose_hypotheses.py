@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers, evenly
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.localization import frozen_in
@@ -38,6 +38,7 @@ from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, Purpose
 from pkmcal.identify.hand_eye import closed_forms, start_from_poses
+from pkmcal.identify.length_registration import determines_legs, register_by_lengths
 from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import identified
@@ -390,8 +391,8 @@ def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
     and the readings.
 
     Each pair of a station and a mount on the platform is registered separately, by the best of the
-    closed forms. Cases may differ in their readings and in their poses' stations, mounts and
-    values.
+    closed forms, or by the legs' lengths at whole poses where these do not hold the platform. Cases
+    may differ in their readings and in their poses' stations, mounts and values.
     """
     joints = np.stack([case.joints for case in cases])
     fk = machine.forward_result(joints.reshape(-1, joints.shape[-1])).T_base_platform
@@ -411,7 +412,14 @@ def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
         for s, m in pairs[on_platform[pairs[:, 1]]]:
             own = np.flatnonzero((poses.station == s) & (poses.mount == m))
             at = poses.configuration[own]
-            squares.append(_laid(body[group][:, at], observed[:, own], poses.whiten[own]))
+            if machine.layout.underdetermined and determines_legs(poses.select(own)):
+                laid = register_by_lengths(
+                    machine, joints[group][:, at], observed[:, own], poses.whiten[own],
+                    cases[0].joint_noise,
+                ).squares  # fmt: skip
+            else:
+                laid = _laid(body[group][:, at], observed[:, own], poses.whiten[own])
+            squares.append(laid)
         if squares:
             out[group] = _usual(np.concatenate(squares, axis=1))
     return out
@@ -460,6 +468,8 @@ def nominal_misfit(
     exact[moving, :3, 3] = fk[moving, :3, 3]
     exact[whole, :3, :3] = fk[whole, :3, :3]
     nominal = replace(measurements, poses=replace(poses, T_station_target=exact))
+    if machine.layout.underdetermined:
+        nominal = _about_home(machine, nominal, moving)
     spread = machine.parameters.tolerance
     for _ in range(options.draws):
         values = machine.values + spread * rng.normal(size=len(spread))
@@ -469,6 +479,19 @@ def nominal_misfit(
         if unit >= enough:
             break
     return unit
+
+
+def _about_home(machine: Machine, measurements: Measurements, moving: Booleans) -> Measurements:
+    """Measurements without noise of the nominal machine, at poses that differ from home as the
+    measured ones of the mounts on the platform do from their middle.
+    """
+    poses, joints = measurements.poses, measurements.joints.copy()
+    middle = middle_pose(poses.T_station_target[moving])
+    around = machine.home() @ inverse(middle) @ poses.T_station_target[moving]
+    joints[poses.configuration[moving]] = machine.inverse(around)
+    exact = poses.T_station_target.copy()
+    exact[moving] = around
+    return replace(measurements, joints=joints, poses=replace(poses, T_station_target=exact))
 
 
 # ------------------------------------------------------------------ hypotheses

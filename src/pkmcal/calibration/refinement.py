@@ -29,6 +29,8 @@ from pkmcal.identify.confirmation import rejected_units
 from pkmcal.identify.covariance import covariance_by_noise, machine_covariance
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.hand_eye import start_from_poses
+from pkmcal.identify.length_registration import determines_legs
 from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import edge_misfit, start_state
 from pkmcal.identify.state import State
@@ -552,8 +554,11 @@ def identify_poses(
     progress("Identifying", 0.0)
     machine = session.machine
     measurements = measurements_of(session, boards, None, cameras)
-    start = start_state(machine, measurements, T_camera_base, session.forward)
-    start = _feasible_start(session, measurements, start)
+    if machine.layout.underdetermined and determines_legs(measurements.poses):
+        start = start_from_poses(machine, measurements)
+    else:
+        start = start_state(machine, measurements, T_camera_base, session.forward)
+        start = _feasible_start(session, measurements, start)
     estimate = bundle(machine, measurements, start)
     turns = options.passes if cameras.active else 2 if measurements.effects else 1
     for turn in range(1, turns):

@@ -86,7 +86,8 @@ def machine_view(
     """View of a machine whose given legs are seen by a camera; by default all legs with tubes.
 
     Each leg is seen by its tube with the longest visible length at home. Raises InputError for a
-    leg that does not exist, is repeated or has no tube, and for cables over pulleys.
+    leg that does not exist, is repeated or has no tube, for cables over pulleys, and for joints
+    whose axes do not meet.
     """
     if machine.layout.windings:
         raise InputError(
@@ -94,6 +95,12 @@ def machine_view(
             " seen",
             found="cables on pulleys or spools",
             expected="joints other than pulley and spool",
+        )
+    if len(machine.layout.offsets):
+        raise InputError(
+            what=f"control by the legs of {machine.name!r} takes rods between joint centres",
+            found="universal joints whose axes do not meet",
+            expected="joints without offset",
         )
     tubed = [j for j, leg in enumerate(machine.document.legs) if leg.tubes]
     wanted = np.array(tubed if legs is None else legs, dtype=int)

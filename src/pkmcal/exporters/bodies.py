@@ -24,10 +24,11 @@ from pkmcal.exporters.home import (
     universal_hinges,
 )
 from pkmcal.exporters.limbs import FIXED_CARRIER, SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER
-from pkmcal.exporters.read_model import DISPLAY_MARK
+from pkmcal.exporters.read_model import BASE_CROSS, DISPLAY_MARK, PLATFORM_CROSS
 from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS, platform_carriers
+from pkmcal.mechanisms.joints import joint_offsets
 from pkmcal.outcome.finding import Finding, note
 
 BODY_COLOURS = {
@@ -309,19 +310,33 @@ def _add_legs(
     for j, (holder, point) in enumerate(held):
         parent = _carrier(bodies, home, j, motors)
         origin = parent.T_base_body[:3, 3]
-        name, length = f"leg{j + 1}", float(home.distance[j])
-        place = pose(np.eye(3), home.a[j] - origin)
-        middle = home.u[j] * length / 2
-        rod = _body(
-            bodies,
-            TreeBody(f"{name}_rod", parent, place, middle, length, comment=_description(home, j)),
-        )
-        for hinge, axis in _base_hinges(home, j):
-            rod.joints.append(BodyJoint(f"{name}_{hinge}", "hinge", axis))
-        rod.points[f"{name}_base"] = np.zeros(3)
+        name, length, comment = f"leg{j + 1}", float(home.distance[j]), _description(home, j)
+        place, middle = pose(np.eye(3), home.a[j] - origin), home.u[j] * length / 2
+        hinges = [
+            BodyJoint(f"{name}_{kind}", "hinge", axis) for kind, axis in _base_hinges(home, j)
+        ]
+        ahead, beyond = home.rods[0, j] - home.a[j], home.b[j] - home.rods[1, j]
+        first = None
+        if ahead.any():  # the cross of a joint whose axes do not meet, with both axes
+            cross_name, reach = f"{name}{BASE_CROSS}", float(np.linalg.norm(ahead))
+            first = TreeBody(cross_name, parent, place, ahead / 2, reach, comment=comment)
+            first.joints.append(hinges.pop(0))
+            _body(bodies, first)
+            parent, place, comment = first, pose(np.eye(3), ahead), ""
+        rod = TreeBody(f"{name}_rod", parent, place, middle, length, comment=comment)
+        rod.joints.extend(hinges)
+        _body(bodies, rod)
+        (first or rod).points[f"{name}_base"] = np.zeros(3)
         tip, end = _tip(bodies, rod, home, j)
+        hinged = _end_hinges(home, j)
+        if beyond.any():
+            (kind, axis), *hinged = hinged
+            place, reach = pose(np.eye(3), end), float(np.linalg.norm(beyond))
+            tip = _body(bodies, TreeBody(f"{name}{PLATFORM_CROSS}", tip, place, beyond / 2, reach))
+            tip.joints.append(BodyJoint(f"{name}_{kind}", "hinge", axis))
+            end = beyond
         tip.points[f"{name}_tip"] = end
-        yield Loop(name, holder, point, tip, end, _end_hinges(home, j))
+        yield Loop(name, holder, point, tip, end, tuple(hinged))
 
 
 def _description(home: HomeState, j: int) -> str:
@@ -332,7 +347,9 @@ def _description(home: HomeState, j: int) -> str:
         driven = home.limbs.drive[j] == TELESCOPE_ROD
         rod = "a rod that its motor moves" if driven else "a passive rod"
     out = f"Leg {j + 1}: {leg.base.joint} on the base, {rod}, {leg.platform.joint} on the platform."
-    if not equations and home.machine.document.motion not in PLANAR_MOTIONS:
+    if any(joint_offsets(home.machine.document).get(j, ())):
+        out += " The two axes of its universal joints do not meet."
+    elif not equations and home.machine.document.motion not in PLANAR_MOTIONS:
         out += (
             " Two hinges and a ball: its turn about its own line, which moves nothing, is left out."
         )
@@ -416,7 +433,8 @@ def _base_hinges(home: HomeState, j: int) -> Iterator[tuple[str, Array]]:
         first, second = universal_hinges(home, j)
         yield "base_first", first
         yield "base_second", second
-    if "revolute platform" in equations:
+    _, offset = joint_offsets(home.machine.document).get(j, (0.0, 0.0))
+    if "revolute platform" in equations or offset:
         yield "twist", home.u[j]
 
 
@@ -426,6 +444,11 @@ def _end_hinges(home: HomeState, j: int) -> tuple[tuple[str, Array], ...]:
     Empty where they act as a ball joint.
     """
     equations, own = home.equations[j], joint_axis(home, "platform", j)
+    _, offset = joint_offsets(home.machine.document).get(j, (0.0, 0.0))
+    if own is not None and offset:
+        axis = home.rot @ own
+        second = cross(axis, home.u[j])
+        return ("platform_second", second / np.sqrt(dot(second, second))), ("platform_first", axis)
     if own is not None and "torsion" in equations:
         second = universal_hinges(home, j)[1]
         return ("platform_second", second), ("platform_first", home.rot @ own)

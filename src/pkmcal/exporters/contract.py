@@ -90,8 +90,10 @@ class Exporter(ABC):
         is not taken for the new one's.
     holds_screws : whether it has the screws that joints turn; other formats take readings to be
         lengths.
-    holds_effects : whether it has the sag under a load, the thermal growth, and universal joints
-        whose axes do not meet; it is the mechanism file.
+    holds_joint_offsets : whether it has universal joints whose axes do not meet; other formats have
+        one centre for both axes.
+    holds_effects : whether it has the sag under a load and the thermal growth; it is the mechanism
+        file.
     """
 
     name: ClassVar[str]
@@ -99,6 +101,7 @@ class Exporter(ABC):
     trial: ClassVar[str] = ""
     leaves: ClassVar[tuple[str, ...]] = ()
     holds_screws: ClassVar[bool] = False
+    holds_joint_offsets: ClassVar[bool] = False
     holds_effects: ClassVar[bool] = False
 
     @abstractmethod
@@ -186,14 +189,12 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
         source = replace(source, machine=machine.with_screws_held())
         change = largest(source.machine.inverse(poses), joints)
         more.append(_by_error(note("export.without_screws", program=name, largest=change)))
+    if len(machine.layout.offsets) and not exporter.holds_joint_offsets:
+        poses, joints = samples(source.machine)
+        source = replace(source, machine=source.machine.with_meeting_axes(poses))
+        change = largest(source.machine.inverse(poses), joints)
+        more.append(_by_error(note("export.without_joint_offsets", program=name, largest=change)))
     if not exporter.holds_effects:
-        if len(machine.layout.offsets):
-            poses, joints = samples(source.machine)
-            source = replace(source, machine=source.machine.with_meeting_axes(poses))
-            change = largest(source.machine.inverse(poses), joints)
-            more.append(
-                _by_error(note("export.without_joint_offsets", program=name, largest=change))
-            )
         more += _without_effects(machine, name)
     files = exporter.files(source)
     differences = tuple(exporter.check(files, source))

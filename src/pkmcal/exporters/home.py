@@ -13,8 +13,14 @@ from pkmcal.exporters.limbs import SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER, L
 from pkmcal.geometry.rigid import cross, dot, inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.mechanisms.joints import Equation, equations
-from pkmcal.mechanisms.kinematics import forward, inverse_result, on_manifold
+from pkmcal.mechanisms.joints import Equation, equations, joint_offsets
+from pkmcal.mechanisms.kinematics import (
+    closure_at,
+    forward,
+    inverse_result,
+    on_manifold,
+    undriven,
+)
 
 SAME_HINGE_DIFFERENCE = 1e-9
 """Tolerance, m and rad, between a common axis or hinge of two legs: rounding."""
@@ -36,8 +42,10 @@ class HomeState:
     readings : (m,) m or rad.
     internal : (n,) angles of the bars' hinges, rad.
     a, b : (L, 3) ends of the limbs, base frame, m.
-    u : (L, 3) unit directions from a to b.
-    distance : (L,) m.
+    rods : (2, L, 3) ends of the rods on base and platform: a and b, except where a joint's axes do
+        not meet.
+    u : (L, 3) unit directions of the rods.
+    distance : (L,) lengths of the rods, m.
     equations : closure equations of each leg's axes.
     """
 
@@ -48,6 +56,7 @@ class HomeState:
     internal: Array
     a: Array
     b: Array
+    rods: Array
     u: Array
     distance: Array
     equations: tuple[frozenset[Equation], ...]
@@ -121,15 +130,17 @@ def home_state(machine: Machine) -> HomeState:
     reached = bool(np.isfinite(readings).all())
     fk = forward(layout, values, readings, near, internal) if reached else None
     if fk is None or not bool(fk.converged):
+        gap = float(np.abs(undriven(closure_at(layout, values, machine.home()))[0]).max(initial=0))
         raise GeometryError(
-            f"mechanism {machine.name!r} does not close at its home pose",
-            found="no readings" if fk is None else f"a gap of {float(fk.error) * 1e3:.3g} mm",
+            f"mechanism {machine.name!r} does not close at its home pose, and at none near it",
+            found=f"a gap of {gap * 1e3:.3g} mm at home" if np.isfinite(gap) else "no readings",
             expected="a pose that all legs reach",
             next_step="give home: {position: [x, y, z]} in the mechanism file",
             code="mechanism.home_not_closed",
         )
     ends = limb_ends(layout, values, readings, fk.T_base_platform, fk.internal)
-    line = ends.b - ends.a
+    rods = np.stack(ends.rods)
+    line = rods[1] - rods[0]
     distance = np.sqrt(dot(line, line))
     closure = equations(machine.document)
     return HomeState(
@@ -140,6 +151,7 @@ def home_state(machine: Machine) -> HomeState:
         fk.internal,
         np.array(ends.a),
         np.array(ends.b),
+        rods,
         line / distance[:, None],
         distance,
         tuple(frozenset(kind for leg, kind in closure if leg == j) for j in range(machine.n_legs)),
@@ -163,14 +175,17 @@ def joint_axis(home: HomeState, side: str, j: int) -> Array | None:
 def universal_hinges(home: HomeState, j: int) -> tuple[Array, Array]:
     """First and second hinge axis (3,) of leg j's universal joint on the base side, base frame.
 
-    The second is perpendicular to the first and to the leg. If a torsion equation depends on the
-    first, it is the file's. Otherwise it is the file's axis, or that of the motor that turns the
-    leg, unless the leg is nearly parallel; then the horizontal axis perpendicular to the leg.
+    The second is perpendicular to the first and to the leg. If a torsion equation or an offset
+    depends on the first, it is the file's. Otherwise it is the file's axis, or that of the motor
+    that turns the leg, unless the leg is nearly parallel; then the horizontal axis perpendicular to
+    the leg.
     """
     u, drive = home.u[j], home.limbs.drive[j]
     drawn = home.limbs.axis[j] if drive == TURN_CARRIER else joint_axis(home, "base", j)
     least = SAME_HINGE_DIFFERENCE if "torsion" in home.equations[j] else LEAST_SINE_TO_LEG
     # the axis of a slide is not a hinge
+    if j in joint_offsets(home.machine.document):
+        least = SAME_HINGE_DIFFERENCE
     if drawn is not None and drive != SLIDE_CARRIER and np.linalg.norm(cross(drawn, u)) > least:
         first = drawn
     else:

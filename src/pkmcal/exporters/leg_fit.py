@@ -21,6 +21,13 @@ GEOMETRY_SHARE = 1e-4
 direction, rad: two numbers that files round to four decimals differ by 1e-4 at most."""
 
 
+NO_TWIST = (
+    "the axes of a joint do not meet, and it may not twist",
+    "two hinges at each end",
+    "a ball at one end, or a hinge along the leg",
+)
+
+
 class Chain(NamedTuple):
     """Steps from a body on the base's side to one on the platform's side."""
 
@@ -43,6 +50,46 @@ def _meeting_point(steps: Sequence[Step]) -> tuple[Array, float]:
         point = np.linalg.lstsq(np.sum(across, axis=0), sums, rcond=1e-9)[0]
     off = [np.linalg.norm(P @ (point - s.point)) for P, s in zip(across, steps, strict=True)]
     return point, float(max(off))
+
+
+class LegEnd(NamedTuple):
+    """End of a leg.
+
+    joints : in the order of the chain. point : (3,) of the rod. miss : largest distance of the
+    joints' axes from it, m. center : (3,) of the joint, on its first axis. axis : (3,) unit first
+    axis, fixed to the body, of a universal joint whose axes do not meet; None for other joints.
+    """
+
+    joints: Sequence[Step]
+    point: Array
+    miss: float
+    center: Array
+    axis: Array | None = None
+
+    @classmethod
+    def meeting(cls, joints: Sequence[Step]) -> LegEnd:
+        """End whose axes meet in a point."""
+        point, miss = _meeting_point(joints)
+        return cls(joints, point, miss, point)
+
+    @classmethod
+    def offset(cls, joints: Sequence[Step], first: int) -> LegEnd:
+        """End with a universal joint whose axes do not meet.
+
+        first : 0 or -1, the joint on the body. The common normal of both axes leads from the
+        joint's centre to the rod; a third joint, about the rod, leads through the same point.
+        """
+        if not 2 <= len(joints) <= 3 or any(s.kind != "hinge" for s in joints):
+            return cls.meeting(joints)
+        body, near_rod, *twist = list(joints)[:: 1 if first == 0 else -1]
+        normal = cross(body.axis, near_rod.axis)
+        if np.linalg.norm(normal) < 1 - GEOMETRY_SHARE:
+            return cls.meeting(joints)
+        gap = near_rod.point - body.point
+        center = body.point + body.axis * float(gap @ body.axis)
+        point = near_rod.point - near_rod.axis * float(gap @ near_rod.axis)
+        off = [cross(s.axis, point - s.point) for s in twist]
+        return cls(joints, point, float(np.linalg.norm(off)), center, body.axis)
 
 
 class LegFit:
@@ -76,19 +123,28 @@ class LegFit:
                 ", ".join(s.kind for s in steps),
                 "hinges or a ball at either end, and at most one slide between them",
             )
-        near, far, a, b, miss = min(
-            ((near, far, p, q, max(off, out)) for near, far in options
-             for (p, off), (q, out) in [(_meeting_point(near), _meeting_point(far))]
-             if np.linalg.norm(q - p) > tolerance),
-            key=lambda option: option[-1] > tolerance,
-            default=(steps, steps, np.zeros(3), np.zeros(3), np.inf),
-        )  # fmt: skip
-        if miss > tolerance:
+        ends = [(LegEnd.meeting(near), LegEnd.meeting(far)) for near, far in options]
+        # an end whose axes do not meet may have a joint with offset axes
+        ends += [
+            (
+                near if near.miss <= tolerance else LegEnd.offset(near.joints, 0),
+                far if far.miss <= tolerance else LegEnd.offset(far.joints, -1),
+            )
+            for near, far in ends
+        ]
+        apart = [
+            (near, far) for near, far in ends if np.linalg.norm(far.point - near.point) > tolerance
+        ]
+        fitting = [pair for pair in apart if max(end.miss for end in pair) <= tolerance]
+        if not fitting:
+            miss = min((max(end.miss for end in pair) for pair in apart), default=np.inf)
             raise self.error(
                 "the axes of the joints at one of its ends do not meet in a point",
                 f"{millimetres(miss)} from the nearest point to one of them",
-                "a common point",
+                "a common point, or the two axes of a universal joint at right angles",
             )
+        self.ends = fitting[0]
+        (near, a, *_), (far, b, *_) = self.ends
         # a single hinge has the point on its axis that is opposite the other end
         if len(near) == 1 and near[0].kind == "hinge" and "planar" not in motion:
             a = near[0].point + near[0].axis * float((b - near[0].point) @ near[0].axis)
@@ -152,11 +208,18 @@ class LegFit:
             rod += f", range: {list_text([low, high])}}}" if 0 < low < high else "}"
         gear = 1.0 if self.column < 0 else float(self.parts.model.gear[self.column])
         held = self._joint("platform") if self.bar is None else self._bar(self.bar)
-        b_platform = (inverse(self.T_base_platform) @ np.append(self.b, 1.0))[:3]
+        if any(end.axis is not None for end in self.ends) and (self.motor or self.bar):
+            raise self.error(
+                "a motor or a bar carries a joint whose axes do not meet",
+                "a universal joint with offset axes",
+                "base and platform themselves at both its ends",
+            )
+        b = self.b if self.ends[1].axis is None else self.ends[1].center
+        b_platform = (inverse(self.T_base_platform) @ np.append(b, 1.0))[:3]
         return NominalLeg(
             base,
             rod,
-            self.a,
+            self.a if self.ends[0].axis is None else self.ends[0].center,
             b_platform,
             held=held,
             scale="" if gear == 1 else number_text(1 / gear),
@@ -192,7 +255,7 @@ class LegFit:
             kind = "revolute" if "planar" in self.motion else "spherical"
             return f"{{joint: {kind}, center: {center}}}"
         near, far = self._across(self.near), self._across(self.far)
-        own = near if side == "base" else far
+        own, end = (near, self.ends[0]) if side == "base" else (far, self.ends[1])
         # hinges along the leg, and balls, let it twist
         count = len(near) + len(far)
         twists = max(len(near), len(far)) > 2 or count < len(self.near) + len(self.far)
@@ -202,6 +265,8 @@ class LegFit:
                 f"{len(near)} hinges on the base and {len(far)} on the platform",
                 "two at each end, or a ball",
             )
+        if end.axis is not None:
+            return self._offset_joint(side, end, end.axis, twists)
         if len(own) == 1:
             if side == "base" and self.motor is not None:
                 raise self.error("one hinge joins it to its motor", "a hinge", "two, or a ball")
@@ -212,6 +277,20 @@ class LegFit:
         axis = T[:3, :3] @ (own[0] if side == "base" else own[-1])
         entry = "" if twists else f", axis: {list_text(axis)}"
         return f"{{joint: universal, center: {center}{entry}}}"
+
+    def _offset_joint(self, side: str, end: LegEnd, axis: Array, twists: bool) -> str:
+        """Entry of a universal joint whose axes do not meet."""
+        if not twists or self.motion != "spatial":
+            raise self.error(*NO_TWIST)
+        T = np.eye(4) if side == "base" else inverse(self.T_base_platform)
+        center, axis = T[:3, :3] @ end.center + T[:3, 3], T[:3, :3] @ axis
+        ahead = self.u if side == "base" else -self.u
+        offset = end.point - end.center
+        size = float(np.copysign(np.linalg.norm(offset), offset @ ahead))
+        return (
+            f"{{joint: universal, center: {list_text(center)}, axis: {list_text(axis)},"
+            f" offset: {number_text(size)}}}"
+        )
 
     def _across(self, steps: Sequence[Step]) -> list[Array]:
         """Axes of hinges that are not along the leg; those of a ball are any three."""

@@ -49,6 +49,7 @@ class MujocoExporter(Exporter):
 
     name: ClassVar = "mujoco"
     title: ClassVar = "MuJoCo model (MJCF) with closed loops"
+    holds_joint_offsets: ClassVar = True
 
     def files(self, source: MachineSource) -> dict[str, str]:
         """MJCF text."""

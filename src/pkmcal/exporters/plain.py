@@ -31,6 +31,7 @@ class MechanismYaml(Exporter):
 
     name: ClassVar = "yaml"
     title: ClassVar = "pkmcal's own mechanism file"
+    holds_joint_offsets: ClassVar = True
     holds_effects: ClassVar = True
 
     def files(self, source: MachineSource) -> dict[str, str]:
@@ -55,6 +56,7 @@ class MachineJson(Exporter):
 
     name: ClassVar = "json"
     title: ClassVar = "names, values, units, deviations and covariance"
+    holds_joint_offsets: ClassVar = True
     holds_effects: ClassVar = True
 
     def files(self, source: MachineSource) -> dict[str, str]:

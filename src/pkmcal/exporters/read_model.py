@@ -27,8 +27,12 @@ JOINT_BODY = " joint"
 """End of the names of bodies that readers add where a joint is beside its body's origin."""
 DISPLAY_MARK = "_display"
 """Part of the names of cylinders that exports add for display, with radii of no tube."""
+BASE_CROSS, PLATFORM_CROSS = "_base_cross", "_platform_cross"
+"""Ends of the names of the bodies between the two axes of a universal joint that do not meet."""
 NO_LIMITS = np.full(2, np.nan)
 MOST_CLOSING_STEPS = 30
+LARGEST_CLOSING_STEP = 0.3
+"""Largest change of a joint in a step, rad or m; the sine of a larger angle is not linear."""
 LOOPS_CLOSED_STEP = 1e-13
 """Largest step of a converged closure, m or rad."""
 DIFFERENCE_QUOTIENT_STEP = 1e-7
@@ -201,9 +205,11 @@ class ReadModel:
             step = (
                 np.linalg.pinv(by_freedom, rcond=DEPENDENT_CONSTRAINT_SHARE) @ residual[..., None]
             )
+            size = np.abs(step[..., 0]).max(axis=-1, keepdims=True)
+            share = LARGEST_CLOSING_STEP / np.maximum(size, LARGEST_CLOSING_STEP)
             x = x.copy()
-            x[:, ~held] -= step[..., 0]
-            if np.abs(step).max() < LOOPS_CLOSED_STEP:
+            x[:, ~held] -= share * step[..., 0]
+            if size.max() < LOOPS_CLOSED_STEP:
                 break
         return x
 

@@ -55,6 +55,7 @@ class SdfExporter(Exporter):
 
     name: ClassVar = "sdf"
     title: ClassVar = "SDF model with closed loops"
+    holds_joint_offsets: ClassVar = True
 
     def files(self, source: MachineSource) -> dict[str, str]:
         """SDF text."""

@@ -9,6 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.exporters.read_model import (
+    BASE_CROSS,
     JOINT_BODY,
     ReadBody,
     ReadCoupling,
@@ -78,9 +79,11 @@ def read_sdf(text: str) -> ReadModel:
         for name, node in tree.frames.items()
         if node.get("attached_to") in tree.numbers
     }
-    for link in tree.links:  # a rod's origin is its base joint
-        if link.endswith("_rod"):
-            sites[f"{link.removesuffix('rod')}base"] = (tree.numbers[link], np.zeros(3))
+    # a rod's origin is its base joint, or that of the joint's own cross, if its axes do not meet
+    for link in sorted(tree.links, key=lambda name: name.endswith(BASE_CROSS)):
+        for ending in ("_rod", BASE_CROSS):
+            if link.endswith(ending):
+                sites[f"{link.removesuffix(ending)}_base"] = (tree.numbers[link], np.zeros(3))
     return ReadModel(
         bodies=tuple(tree.bodies),
         loops=tuple(loops),

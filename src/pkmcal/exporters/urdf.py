@@ -69,6 +69,7 @@ class UrdfExporter(Exporter):
 
     name: ClassVar = "urdf"
     title: ClassVar = "URDF (a tree), and the loops that it cannot hold"
+    holds_joint_offsets: ClassVar = True
 
     def files(self, source: MachineSource) -> dict[str, str]:
         """Texts of the tree and of its loops."""

@@ -5,6 +5,7 @@ Links and joints have the meaning of URDF's documentation.
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal
 from xml.etree.ElementTree import Element
@@ -15,6 +16,7 @@ from pydantic import Field
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.exporters.read_model import (
+    BASE_CROSS,
     NO_LIMITS,
     ReadBody,
     ReadCoupling,
@@ -88,7 +90,8 @@ def read_urdf(text: str, loops: str, loops_name: str = "loops.yaml") -> ReadMode
         key[c.follower] = c.ratio * key[c.leader] + c.offset
     # named links: the two ends of each loop, and each leg's base
     ends = {name: tree.link(name) for loop in beside.loops for name in loop.frames}
-    rods = ((f"{loop.name}_base", f"{loop.name}_rod") for loop in beside.loops)
+    firsts = product(beside.loops, ("_rod", BASE_CROSS))  # a joint's own cross precedes the rod
+    rods = ((f"{loop.name}_base", f"{loop.name}{ending}") for loop, ending in firsts)
     sites = ends | {name: tree.numbers[rod] for name, rod in rods if rod in tree.numbers}
     return ReadModel(
         bodies=tuple(tree.bodies),

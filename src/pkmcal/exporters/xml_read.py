@@ -37,7 +37,13 @@ def xml_root(text: str) -> Element:
     try:
         root = fromstring(text)
     except (ParseError, ValueError) as error:
-        raise InputError("the file is not XML", found=str(error)) from None
+        template = "<%" in text
+        raise InputError(
+            "the file is not XML",
+            found="a template with <% … %>" if template else str(error),
+            expected="the XML that it expands to" if template else None,
+            next_step="Expand it first: erb FILE.erb > FILE" if template else None,
+        ) from None
     check_size(root)
     return root
 

@@ -31,6 +31,7 @@ from pkmcal.geometry.rigid import (
     register,
     skew,
 )
+from pkmcal.identify.length_registration import determines_legs, register_by_lengths
 from pkmcal.identify.start import middle_pose
 from pkmcal.identify.state import State
 from pkmcal.levels import MAJORITY
@@ -245,6 +246,10 @@ def start_from_poses(
     T_camera_base : (S, 4, 4) rough T_camera_base, NaN for stations without one; None without
     any. Raises InputError for a station without any relation to the machine.
     """
+    poses = measurements.poses
+    whole = determines_legs(poses) and measurements.on_platform[poses.mount].all()
+    if machine.layout.underdetermined and whole:
+        return _start_by_lengths(machine, measurements)
     fk = machine.forward_result(measurements.joints)
     n_stations = measurements.n_stations
     usable = fk.converged & np.isfinite(fk.T_base_platform).all(axis=(-1, -2))
@@ -271,6 +276,32 @@ def start_from_poses(
         T_mount=np.where(np.isnan(mounts), np.eye(4), mounts),
         on_platform=measurements.on_platform,
         internal=fk.internal,
+    )
+
+
+def _start_by_lengths(machine: Machine, measurements: Measurements) -> State:
+    """Start at measured poses of one station and one mount on a platform that legs do not hold."""
+    poses, joints = measurements.poses, measurements.joints
+    (T_camera_base,), (T_mount,), _ = register_by_lengths(
+        machine,
+        joints[None, poses.configuration],
+        poses.T_station_target[None],
+        poses.whiten,
+        measurements.joint_noise,
+    )
+    T_base_platform = np.tile(machine.home(), (len(joints), 1, 1))
+    T_base_platform[poses.configuration] = (
+        inverse(T_camera_base) @ poses.T_station_target @ inverse(T_mount)
+    )
+    stations = np.tile(T_camera_base, (measurements.n_stations, 1, 1))
+    mounts = np.tile(T_mount, (len(measurements.on_platform), 1, 1))
+    return State(
+        machine.values,
+        stations,
+        T_base_platform,
+        T_mount=mounts,
+        on_platform=measurements.on_platform,
+        internal=np.zeros((len(joints), machine.layout.n_internal)),
     )
 
 

@@ -157,7 +157,7 @@ class Structure:
     @cached_property
     def strip_parameters(self) -> Integers:
         """Columns (groups, w) on which the edges of each group of views depend: the parameters of
-        both ends, the station, the radii, the effects.
+        both ends, offset joints' axes, the station, the radii, the effects.
         """
         u, layout, views = self.unknowns, self.layout, self.blocks.views
         first = np.array([cut.start for cut in views.groups], dtype=int)
@@ -166,7 +166,10 @@ class Structure:
         for k, one in enumerate(leg):
             radii[k, : len(layout.radius[one])] = self.column[layout.radius[one]]
         effects = self.blocks.view_columns.of_groups
-        parts = [self.column[layout.b_index[leg]], self.column[layout.a_index[leg]]]
+        ends = [layout.b_index[leg], layout.a_index[leg]]
+        if len(layout.offsets):
+            ends.append(layout.offset_axes[leg])
+        parts = [self.column[index] for index in ends]
         parts += [numbered_columns(u.stations, views.station[first], 6), radii]
         parts += [np.where(effects < 0, none, u.effects.start + effects)]
         return np.concatenate(parts, axis=1)

@@ -482,9 +482,11 @@ class EdgeRows:
         return -np.sum(self._turns, axis=0)
 
     def ends_by(self, freedoms: slice) -> Array:
-        """Derivatives (B, N, 4, d + n_b + n_a + 6) of both ends, a before b, along m and along w.
+        """Derivatives (B, N, 4, d + n_b + n_a + n_axes + 6) of both ends, a before b, along m and
+        along w.
 
-        By the configuration's own unknowns, the parameters of b and of a, and the station, whose
+        By the configuration's own unknowns, the parameters of b and of a, where joints have offset
+        axes the six of both axes, and the station, whose
         (omega, tau) moves the ends by ``omega x (p - t) + tau``, with t the base's origin in the
         camera frame.
         """
@@ -498,12 +500,18 @@ class EdgeRows:
         every, limbs = _side_by_side(parts, c.rows.distance.shape), views.limbs(c.layout.n_legs)
         ends = across @ every.take(limbs, axis=1)
         of_b = ends.shape[-1] - c.a_by.shape[-1]
-        out = np.zeros((*ends.shape[:2], 4, ends.shape[-1] + 6))
+        n_axes = 6 if len(c.layout.offsets) else 0
+        out = np.zeros((*ends.shape[:2], 4, ends.shape[-1] + n_axes + 6))
         out[..., 2:, :of_b] = ends[..., :of_b]
-        out[..., :2, of_b:-6] = ends[..., of_b:]
+        out[..., :2, of_b : ends.shape[-1]] = ends[..., of_b:]
         if c.layout.windings:  # a moves on its pulley with b
             by_b = c.a_by_b.reshape(len(every), -1, 3, 3)
             out[..., :2, :of_b] = across @ (by_b @ every[..., :of_b]).take(limbs, axis=1)
+        if n_axes:  # both ends move on their joints' second axes
+            shifted = _shifts_by(c, every.reshape(*c.rows.distance.shape, 3, -1), of_b, freedoms)
+            shifted = np.moveaxis(shifted, 3, 0).reshape(2, *every.shape[:2], 3, -1)
+            for k, by in enumerate(shifted):
+                out[..., 2 * k : 2 * k + 2, :-6] += across @ by.take(limbs, axis=1)
         nearest = line.distance[..., None] * line.u
         for k, place in ((0, line.before), (2, line.behind)):
             # with p = distance w + place u: omega x (p - t) along m is omega . (p x m + m x t)
@@ -511,6 +519,24 @@ class EdgeRows:
             out[..., k + 1, -6:-3] = swung[..., 1, :] - place[..., None] * line.m
             out[..., k, -3:], out[..., k + 1, -3:] = line.m, line.w
         return out
+
+
+def _shifts_by(c: Closure, every: Array, of_b: int, freedoms: slice) -> Array:
+    """Derivatives (B, K, L, 2, 3, n + 6) of the vectors from A and B to the ends of the rods.
+
+    every : (B, K, L, 3, n) derivatives of b in the first ``of_b`` columns, those of a in the
+        others; the first columns are the pose's ``freedoms``.
+    """
+    leg, shifts = c.layout.offsets.leg, c.shifts
+    own = every[..., leg, :, :]
+    by_line = np.concatenate([own[..., :of_b], -own[..., of_b:]], axis=-1)
+    axes = np.concatenate([shifts.by_base_axis, shifts.by_platform_axis], axis=-1)
+    by = np.concatenate([shifts.by_line @ by_line[..., None, :, :], axes], axis=-1)
+    turns = np.eye(3, 6)[:, freedoms]
+    by[..., : turns.shape[1]] += shifts.by_turn @ turns
+    out = np.zeros((*every.shape[:3], *by.shape[-3:]))
+    out[..., leg, :, :, :] = by
+    return out
 
 
 def _side_by_side(parts: tuple[Array, ...], limbs: tuple[int, ...]) -> Array:
@@ -544,7 +570,7 @@ def edge_rows(
     """
     views, limbs = blocks.views, c.rows.distance.shape
     both = np.empty((3, 2, *limbs))
-    both[:, 0], both[:, 1] = (end.transpose(3, 0, 1, 2) for end in (c.base.a, c.platform.b))
+    both[:, 0], both[:, 1] = (end.transpose(3, 0, 1, 2) for end in c.rods)
     both = both.reshape(3, 2, limbs[0], limbs[1] * limbs[2])
     ends = both.take(views.limbs(limbs[2]), axis=-1)
     moves = T_camera_base[..., :3, :].transpose(2, 3, 0, 1).take(views.station, axis=-1)

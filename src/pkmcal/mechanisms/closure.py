@@ -34,7 +34,14 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.batches import fresh, moments
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import by_pose
-from pkmcal.mechanisms.joints import AngleRows, angle_rows, offset_rows, screw_rows
+from pkmcal.mechanisms.joints import (
+    AngleRows,
+    RodShifts,
+    angle_rows,
+    offset_rows,
+    rod_shifts,
+    screw_rows,
+)
 from pkmcal.mechanisms.layout import CarrierGroup, LimbLayout
 
 
@@ -375,6 +382,25 @@ class LimbEnds:
     def a_by_reading(self) -> Array:
         """Derivatives (..., L, 3) of a by the legs' readings."""
         return self._at_readings(self.base.by_reading)
+
+    @cached_property
+    def shifts(self) -> RodShifts:
+        """Vectors from A and B to the ends of the rods ``layout.offsets.leg``."""
+        offsets, rot = self.layout.offsets, self.poses[..., :3, :3]
+        return rod_shifts(offsets, self.theta, rot, (self.b - self.a)[..., offsets.leg, :])
+
+    @cached_property
+    def rods(self) -> tuple[Array, Array]:
+        """Ends (..., L, 3) of the rods, on whose line their tubes are, m, base frame: A and B,
+        except where a joint's second axis is at an offset from its first one.
+        """
+        if not len(self.layout.offsets):
+            return self.a, self.b
+        shape = np.broadcast_shapes(self.a.shape, self.b.shape)
+        ends = [np.array(np.broadcast_to(end, shape)) for end in (self.a, self.b)]
+        for end, shift in zip(ends, np.moveaxis(self.shifts.value, -2, 0), strict=True):
+            end[..., self.layout.offsets.leg, :] += shift
+        return ends[0], ends[1]
 
     def _at_readings(self, values: Array) -> Array:
         """Values of the base side (..., L, 3), broadcast to the batch's shape."""

@@ -95,7 +95,7 @@ def _check_screw(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDo
 
 def _check_offsets(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDocument) -> None:
     """Check that a leg with joints whose axes do not meet is a rod between fixed joints of a
-    spatial machine, and is measured in no image.
+    spatial machine.
     """
     if j not in joint_offsets(document):
         return
@@ -107,14 +107,6 @@ def _check_offsets(document: MechanismDocument, j: int, leg: Leg, place: PlaceIn
             where=place("legs", j),
             found=f"base: {leg.base.joint}, motion: {document.motion}",
             expected="motion: spatial, and a base joint that no motor moves",
-        )
-    if leg.tubes:
-        raise InputError(
-            f"leg {j + 1} has a joint whose axes do not meet: where its tubes are in images is not"
-            " modelled",
-            where=place("legs", j, "tubes"),
-            expected="no tubes",
-            next_step="Leave them out, and observe a board on the platform, or use a tracker",
         )
 
 

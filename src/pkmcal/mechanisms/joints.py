@@ -39,7 +39,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import cross, dot
+from pkmcal.geometry.rigid import cross, dot, skew
 from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
 from pkmcal.mechanisms.document import ActuatedLength, MechanismDocument
 
@@ -215,6 +215,45 @@ def offset_layout(document: MechanismDocument, base: Integers, platform: Integer
     return OffsetLayout(leg, offset, np.where(offset[..., None] != 0, axis, -1))
 
 
+class _OffsetState(NamedTuple):
+    """Rods (..., S) between joints with offset axes.
+
+    v, w : (..., S, 3) unit first axes of the joints on base and platform, base frame.
+    v_size, own_size : (..., S, 1) lengths of these axes as parameters.
+    n, n_platform : (..., S, 3) directions of the offsets; see the module's docstring.
+    rod : (..., S, 3) B' - A', m.
+    """
+
+    v: Array
+    w: Array
+    v_size: Array
+    own_size: Array
+    n: Array
+    n_platform: Array
+    rod: Array
+
+
+def _offset_state(layout: OffsetLayout, theta: Array, rot: Array, line: Array) -> _OffsetState:
+    """Rods at platform rotations (..., 3, 3) and lines B - A (..., S, 3), m."""
+    offset_a, offset_b = layout.offset[:, :1], layout.offset[:, 1:]
+    index = np.maximum(layout.axis, 0)
+    v, v_size = _unit(theta[..., index[:, 0]], offset_a != 0)
+    own, own_size = _unit(theta[..., index[:, 1]], offset_b != 0)
+    w = (rot[..., None, :, :] @ own[..., None])[..., 0]
+
+    def direction(vector: Array, axis: Array, offset: Array) -> Array:
+        # a joint whose axes meet has no such direction; its leg may be parallel to the axis
+        return _direction(np.where(offset != 0, _across(vector, axis), 1.0))
+
+    # A' and B' by turns, from A: each turn is as much better as offsets are shorter than the leg
+    n, n_platform = direction(line, v, offset_a), direction(-line, w, offset_b)
+    for _ in range(OFFSET_TURNS):
+        n = direction(line + offset_b * n_platform, v, offset_a)
+        n_platform = direction(offset_a * n - line, w, offset_b)
+    rod = line + offset_b * n_platform - offset_a * n
+    return _OffsetState(v, w, v_size, own_size, n, n_platform, rod)
+
+
 def offset_rows(layout: OffsetLayout, theta: Array, rot: Array, line: Array) -> AngleRows:
     """Changes of readings by offset axes, |B' - A'| - |B - A|; see the module's docstring.
 
@@ -223,27 +262,70 @@ def offset_rows(layout: OffsetLayout, theta: Array, rot: Array, line: Array) -> 
     line : (..., S, 3) B - A of each leg, m.
     """
     offset_a, offset_b = layout.offset[:, :1], layout.offset[:, 1:]
-    index = np.maximum(layout.axis, 0)
-    v, v_size = _unit(theta[..., index[:, 0]], offset_a != 0)
-    own, own_size = _unit(theta[..., index[:, 1]], offset_b != 0)
-    w = (rot[..., None, :, :] @ own[..., None])[..., 0]
-    # A' and B' by turns, from A: each turn is as much better as offsets are shorter than the leg
-    n, n_platform = _direction(_across(line, v)), _direction(_across(-line, w))
-    for _ in range(OFFSET_TURNS):
-        n = _direction(_across(line + offset_b * n_platform, v))
-        n_platform = _direction(_across(offset_a * n - line, w))
-    start, end = offset_a * n, line + offset_b * n_platform
-    rod = end - start
+    v, w, v_size, own_size, n, n_platform, rod = _offset_state(layout, theta, rot, line)
     length, distance = np.sqrt(dot(rod, rod)), np.sqrt(dot(line, line))
     u = rod / length[..., None]
     by_own = -offset_b * dot(u, w)[..., None] * n_platform
     return AngleRows(
         value=length - distance,
         by_line=u - line / distance[..., None],
-        by_turn=cross(end - line, u),
+        by_turn=cross(offset_b * n_platform, u),
         by_base_axis=offset_a * dot(u, v)[..., None] * n / v_size,
         by_platform_axis=(rot.mT[..., None, :, :] @ by_own[..., None])[..., 0] / own_size,
     )
+
+
+class RodShifts(NamedTuple):
+    """Vectors from A to A' and from B to B' (..., S, 2, 3), m, with their derivatives (..., S, 2,
+    3, 3) by the leg's line B - A, by the platform's rotation, and by the parameters of both axes.
+    """
+
+    value: Array
+    by_line: Array
+    by_turn: Array
+    by_base_axis: Array
+    by_platform_axis: Array
+
+
+def rod_shifts(layout: OffsetLayout, theta: Array, rot: Array, line: Array) -> RodShifts:
+    """Ends of rods between joints with offset axes; arguments as of :func:`offset_rows`.
+
+    The directions n(B' - A, v) and n'(A' - B, w) of the offsets e and e' depend on each other:
+    ``dn = N (d line + e' dn') + V dv`` and ``dn' = N' (e dn - d line) + W dw``.
+    """
+    offset_a, offset_b = layout.offset[:, :1], layout.offset[:, 1:]
+    v, w, v_size, own_size, n, n_platform, _ = _offset_state(layout, theta, rot, line)
+    by_vector, by_v = _direction_by(line + offset_b * n_platform, v, n)
+    by_other, by_w = _direction_by(offset_a * n - line, w, n_platform)
+    # columns: line, v, w
+    unit, none = np.broadcast_to(np.eye(3), by_v.shape), np.zeros_like(by_v)
+    system = np.block(
+        [[unit, -offset_b[..., None] * by_vector], [-offset_a[..., None] * by_other, unit]]
+    )
+    right = np.block([[by_vector, by_v, none], [-by_other, none, by_w]])
+    solved = np.linalg.solve(system, right)
+    solved = solved.reshape(*solved.shape[:-2], 2, 3, 9)
+    by_line, by_v, by_w = np.split(layout.offset[..., None, None] * solved, 3, axis=-1)
+    across_v, across_w = (np.eye(3) - axis[..., :, None] * axis[..., None, :] for axis in (v, w))
+    of_own = (across_w @ rot[..., None, :, :]) / own_size[..., None]
+    directions = np.stack([n, n_platform], axis=-2)
+    return RodShifts(
+        value=layout.offset[..., None] * directions,
+        by_line=by_line,
+        by_turn=by_w @ -skew(w)[..., None, :, :],
+        by_base_axis=by_v @ (across_v / v_size[..., None])[..., None, :, :],
+        by_platform_axis=by_w @ of_own[..., None, :, :],
+    )
+
+
+def _direction_by(vector: Array, axis: Array, direction: Array) -> tuple[Array, Array]:
+    """Derivatives (..., 3, 3) of the direction of the part of a vector orthogonal to a unit axis,
+    by the vector and by the axis, (..., 3) each.
+    """
+    size = dot(vector, direction)[..., None, None]
+    rest = np.eye(3) - direction[..., :, None] * direction[..., None, :]
+    by_axis = axis[..., :, None] * vector[..., None, :] + dot(vector, axis)[..., None, None] * rest
+    return (rest - axis[..., :, None] * axis[..., None, :]) / size, -by_axis / size
 
 
 def _direction(vector: Array) -> Array:

@@ -194,6 +194,14 @@ class LimbLayout:
         return np.concatenate([self.screws.leg, self.offsets.leg])
 
     @cached_property
+    def offset_axes(self) -> Integers:
+        """Indices (L, 6) of the first axes' parameters of offset joints, P as padding."""
+        out = np.full((self.n_legs, 6), self.n_parameters)
+        axis = self.offsets.axis.reshape(-1, 6)
+        out[self.offsets.leg] = np.where(axis < 0, self.n_parameters, axis)
+        return out
+
+    @cached_property
     def own_motion(self) -> Array:
         """Directions (6 + n, d + n) of the pose's freedoms, then of the internal coordinates."""
         n, d = self.n_internal, self.motion.shape[1]
@@ -276,10 +284,8 @@ class LimbLayout:
         if self.scales_move_rods:
             parts.append(np.where(self.rod_reads, self.scale, none)[:, None])
         if self.growing.size:
-            turned = np.full((self.n_legs, 6), none)
-            of_offsets = self.offsets.axis.reshape(-1, 6)
-            axes = [self.screws.axes, np.where(of_offsets < 0, none, of_offsets)]
-            turned[self.growing] = np.concatenate(axes)
+            turned = self.offset_axes.copy()
+            turned[self.screws.leg] = self.screws.axes
             parts.append(turned)
         # Rows of lengths: A, B, rod, the rod's scale, and the axes that turn a screw or are
         # offset.

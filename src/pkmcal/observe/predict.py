@@ -110,7 +110,7 @@ def legs_in_camera(
     joints : (K, m) readings.
     """
     ends, camera = machine.ends_at(joints, T_base_platform), T_camera_base[..., None, :, :]
-    a, b = np.broadcast_arrays(apply(camera, ends.a), apply(camera, ends.b))
+    a, b = np.broadcast_arrays(*(apply(camera, end) for end in ends.rods))
     return LegsInCamera(a, b, line_through(a, b)[0])
 
 

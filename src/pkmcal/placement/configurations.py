@@ -190,10 +190,9 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
     Legs with a common joint are exempt, as in nominal models that reduce the platform to a point:
     such legs come near each other nowhere else.
     """
-    limbs = machine.ends_at(joints, T_base_platform)
-    ends = limbs.a, limbs.b
+    ends = machine.ends_at(joints, T_base_platform).rods
     along = np.linspace(*LEG_MIDDLE, GUIDE_SAMPLES)[:, None]
-    points = limbs.a[..., None, :] * (1 - along) + limbs.b[..., None, :] * along
+    points = ends[0][..., None, :] * (1 - along) + ends[1][..., None, :] * along
     widths = np.array([r.max() if len(r) else 0.0 for r in machine.radii()])
     drives = drives_of(machine)
     touching = touching_legs(ends, leg_distances(ends), widths)

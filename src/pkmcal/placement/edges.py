@@ -82,7 +82,7 @@ def simulate_edges(
     for station, one in enumerate(cameras):
         rows = images[images[:, 0] == station, 1]
         ends = machine.ends_at(joints[rows], T_base_platform[rows])
-        a, b = apply(T_camera_base[station], ends.a), apply(T_camera_base[station], ends.b)
+        a, b = (apply(T_camera_base[station], end) for end in ends.rods)
         exact, rays = visible_edges(one, tubes, machine.values[tubes.radius], a, b)
         exact = replace(
             exact,

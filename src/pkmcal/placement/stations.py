@@ -283,9 +283,9 @@ def in_picture(
     T_base_platform : (K, 4, 4). joints : (K, m). The end of a leg may lie outside the image; an
     image with half a machine is not usable.
     """
-    ends = machine.ends_at(joints, T_base_platform)
+    a, b = machine.ends_at(joints, T_base_platform).rods
     along = np.linspace(0.06, 0.96, 12)[:, None]
-    points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
+    points = a[..., None, :] * (1 - along) + b[..., None, :] * along
     pixels = camera.project(apply(T_camera_base, points))
     share = camera.in_image(pixels, margin=6.0).mean(axis=-1)
     return (share.mean(axis=-1) > 0.8) & (share.min(axis=-1) > 0.4)

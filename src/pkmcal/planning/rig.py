@@ -136,8 +136,8 @@ class BoardFrom:
         machine, tubes = at.machine, tubes_of(at.machine)
         if not len(tubes):
             return visible
-        ends = machine.ends_at(at.joints, at.T_base_platform)
-        a, b = apply(self.T_camera_base, ends.a), apply(self.T_camera_base, ends.b)
+        rods = machine.ends_at(at.joints, at.T_base_platform).rods
+        a, b = (apply(self.T_camera_base, end) for end in rods)
         nothing, radius = np.array([-1]), machine.values[tubes.radius]
         pixel = pixel_angle(self.camera)
         behind = hidden(there[:, None], nothing, nothing, tubes, radius, a, b, pixel)

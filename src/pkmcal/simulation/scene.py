@@ -162,6 +162,7 @@ def machine_parts(
     as_built : with motors, rings and cables on the legs that are not in the nominal model.
     """
     ends = machine.ends_at(joints, T_base_platform)
+    a, b = ends.rods
     balls = _ball_radii(machine)
     bars = side_bars(machine)
     chains = machine.arms_at(joints)
@@ -170,9 +171,9 @@ def machine_parts(
     for j in range(machine.n_legs):
         driven = bool(discs.drives.arms[j] or discs.drives.guides[j])
         bare = finish.forearm if driven else finish.steel
-        parts += _leg(machine, j, ends.a[j], ends.b[j], finish, bare)
+        parts += _leg(machine, j, a[j], b[j], finish, bare)
         if as_built:
-            parts += _hung_on(machine, j, ends.a[j], ends.b[j], discs, finish)
+            parts += _hung_on(machine, j, a[j], b[j], discs, finish)
         parts += _base_end(discs, j, chains[j], balls[:, 0], finish)
     return parts
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import ClassVar, final
@@ -19,7 +19,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
-from pkmcal.files import MOST_MACHINE_LEGS, check_count, quoted
+from pkmcal.files import MOST_MACHINE_LEGS, check_count, closest, quoted
 from pkmcal.files.quantities import LARGEST_UNITLESS_LENGTH, split_head
 from pkmcal.starter.families import DIMENSIONS
 from pkmcal.starter.nominal import NominalLeg, NominalModel, Screw, millimetres
@@ -29,6 +29,13 @@ from pkmcal.wording import listed
 UNITS: Mapping[str, float] = {"mm": 1e-3, "inch": 0.0254}
 """LinuxCNC's units of length, m."""
 STRUTS = 6
+PINS = (
+    *(f"{group}.{strut}.{axis}" for group, strut, axis in product(
+        ("base", "platform", "base-n", "platform-n"), range(STRUTS), "xyz")),
+    "screw-lead", "spindle-offset", "tool-offset",
+    "convergence-criterion", "limit-iterations", "max-error",
+)  # fmt: skip
+"""Pins and parameters of genhexkins that a HAL file sets."""
 COLUMNS = tuple(f"{end}_{axis}" for end, axis in product(("base", "platform"), "xyz"))
 EXPECTED_HEADER = f"leg,{','.join(f'{name} [mm]' for name in COLUMNS)}"
 NEEDS, TAKES = ("leg",), ("travel", "tube_radius")
@@ -163,6 +170,16 @@ def _of_hal(
             ),
         )
     pins = {name: (value, m) for m in _PIN.finditer(text) for name, value in [m.groups()]}
+    for name, (_, match) in pins.items():
+        if name not in PINS:
+            another_strut = re.fullmatch(r"(base|platform)(-n)?\.\d+\.[xyz]", name)
+            guess = None if another_strut else closest(name, PINS)
+            raise InputError(
+                "genhexkins has no such pin",
+                where=f"{label}, line {_line(text, match)}",
+                found=quoted(f"genhexkins.{name}"),
+                expected=f"genhexkins.{guess}" if guess else "pins of six struts, from 0 to 5",
+            )
 
     def pin(name: str, what: str) -> float:
         if name not in pins:
@@ -173,8 +190,7 @@ def _of_hal(
                 expected=f"setp genhexkins.{name} VALUE",
             )
         value, match = pins[name]
-        line = text.count("\n", 0, match.start(1)) + 1
-        return _number(value, f"{label}, line {line}, genhexkins.{name}")
+        return _number(value, f"{label}, line {_line(text, match)}, genhexkins.{name}")
 
     def vectors(group: str, what: str) -> Array:
         names = ([f"{group}.{strut}.{axis}" for axis in "xyz"] for strut in range(STRUTS))
@@ -196,6 +212,11 @@ def _of_hal(
     return base, platform, tuple(Screw(lead * UNITS[unit], *pair) for pair in axes / size)
 
 
+def _line(text: str, match: re.Match[str]) -> int:
+    """Line, from 1, of a pin."""
+    return text.count("\n", 0, match.start(1)) + 1
+
+
 def _of_table(text: str, label: str) -> tuple[Array, Array]:
     """Centres (L, 3) of base and platform, m, of a table."""
     rows = [
@@ -211,6 +232,7 @@ def _of_table(text: str, label: str) -> tuple[Array, Array]:
             where=f"{label}, line {rows[0][0] if rows else 1}",
             found=quoted(",".join(names)),
             expected=EXPECTED_HEADER,
+            next_step=_other_table(rows[0][1] if rows else []),
         )
     if wrong := [name for name, head_unit in heads[1:] if head_unit and head_unit.kind != "m"]:
         raise InputError(
@@ -228,7 +250,15 @@ def _of_table(text: str, label: str) -> tuple[Array, Array]:
             expected=f"{STRUTS} or more",
         )
     values = np.empty((len(rows) - 1, 6))
+    lines = dict[str, int]()
     for row, (line, cells) in enumerate(rows[1:]):
+        if lines.setdefault(cells[0], line) != line:
+            raise InputError(
+                "two rows have one leg",
+                where=f"{label}, line {line}, leg",
+                found=quoted(cells[0]),
+                expected=f"another leg than that of line {lines[cells[0]]}",
+            )
         if len(cells) != len(names):
             raise InputError(
                 "a row has another number of cells than the header",
@@ -240,6 +270,15 @@ def _of_table(text: str, label: str) -> tuple[Array, Array]:
             values[row, k] = _number(cell, f"{label}, line {line}, {COLUMNS[k]}")
     values *= [1.0 if head_unit is None else head_unit.factor for _, head_unit in heads[1:]]
     return values[:, :3], values[:, 3:]
+
+
+def _other_table(header: Sequence[str]) -> str | None:
+    """Next step for a header of a kind that occurs."""
+    if len(header) == 1 and ";" in header[0]:
+        return "Separate the columns by commas, and write decimal points"
+    if any(re.search(r"phi|angle|radius|_r\b", head.lower()) for head in header):
+        return "Write x, y and z, or polar centres in mechanism.yaml (docs/files.md)"
+    return None
 
 
 def _number(text: str, where: str) -> float:

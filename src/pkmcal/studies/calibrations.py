@@ -400,7 +400,7 @@ def _measured_edges(
         place = (slice(None), edges.configuration[own], edges.leg[own])
         a, b = (
             apply(capture.T_camera_base[station], np.broadcast_to(e, ends.b.shape)[place])
-            for e in (ends.a, ends.b)
+            for e in ends.rods
         )
         u, m = line_through(a, b)
         # Exact edge normals, and their rotations by a shift and a tilt of one pixel.

@@ -260,7 +260,8 @@ def _edges(
         rows = pairs[pairs[:, 0] == station, 1]
         ends = machine.ends_at(joints[rows], poses[rows])
         radius = machine.values[tubes.radius]
-        exact, _ = visible_edges(camera, tubes, radius, apply(T, ends.a), apply(T, ends.b))
+        a, b = (apply(T, end) for end in ends.rods)
+        exact, _ = visible_edges(camera, tubes, radius, a, b)
         place = np.full(len(exact), station)
         # the problem gets a column for each shift that is not zero; each run has its own
         shift = np.broadcast_to([1.0, 0.0], exact.shift.shape)

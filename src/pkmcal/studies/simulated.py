@@ -107,7 +107,7 @@ def simulate_runs(
         # Axes of the observed legs.
         ends = limb_ends(machine.layout, theta[:, None], readings, T_base_platform)
         k = np.arange(count)[:, None]
-        a, b = (apply(camera[:, None], p[:, k, view.legs]) for p in (ends.a, ends.b))
+        a, b = (apply(camera[:, None], p[:, k, view.legs]) for p in ends.rods)
         axis = to_coordinates(a, b)
         axis = axis + noise.axis * rng.normal(size=axis.shape)
     if view.T_platform_board is not None:
