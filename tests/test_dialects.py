@@ -5,16 +5,27 @@ and Repetier-Firmware's files.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import printers
-from dialects import DIALECTS, HEIGHT_OFFSET, STEPS, Ideal, carried, commands, perturbed
+from dialects import (
+    DIALECTS,
+    HEIGHT_OFFSET,
+    STEPS,
+    Ideal,
+    carried,
+    commands,
+    letters,
+    perturbed,
+)
 from export_sources import source_of
 from faults import raises
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
+from pkmcal.exporters.delta import delta_of
 from pkmcal.exporters.delta_texts import read_firmware_from_base
 from pkmcal.firmware.contract import firmwares, read_printer
 from pkmcal.firmware.probed import read_measured
@@ -51,8 +62,8 @@ delta_tower3_angle 0.3
 alpha_steps_per_mm   80
 beta_steps_per_mm    80
 gamma_steps_per_mm   100
-alpha_trim -0.25
-gamma_trim -1.5
+alpha_trim_mm -0.25
+gamma_trim_mm -1.5
 gamma_max            300
 """
 REPETIER = """\
@@ -98,7 +109,7 @@ def test_the_forward_kinematics_in_known_places():
 @pytest.mark.parametrize("to", DIALECTS)
 @pytest.mark.parametrize("seed", range(20))
 def test_a_firmware_goes_where_the_machine_goes(seed, to):
-    machine, rng = perturbed(seed)
+    machine, rng = perturbed(seed, to=to)
     (text,) = make_export(source_of(machine), to).files.values()
     ideal = DIALECTS[to](text, HEIGHT_OFFSET)
     travel = carried(machine, rng)
@@ -122,6 +133,9 @@ def test_a_printer_is_read_and_written_back(text, name, tmp_path):
     want = 300 + np.sqrt(printer.rod**2 - 105**2) + [0.25, 0.0, 1.5]
     np.testing.assert_allclose(printer.homed, want)
     assert printer.reach == (90.0 if name == "repetier" else None)
+    if name == "smoothie":  # rods of one length, as it has without builds of a pull request
+        printer = replace(printer, rod=np.full(3, 270.0))
+        want = printer.homed
     machine = load_mechanism(text_file(tmp_path, nominal_text(printer), "m.yaml"))
     (out,) = make_export(source_of(machine), name).files.values()
     ideal = DIALECTS[name](out, 0.0)
@@ -130,6 +144,23 @@ def test_a_printer_is_read_and_written_back(text, name, tmp_path):
     again = read_printer(text_file(tmp_path, out, "again.txt"))
     assert again.firmware.name == name
     np.testing.assert_allclose(again.homed, want, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rods_of_different_lengths_are_one_for_smoothieware(seed):
+    """It has one length: the best one is written, and the error that remains is stated."""
+    machine, _ = perturbed(seed)
+    export = make_export(source_of(machine), "smoothie")
+    (text,) = export.files.values()
+    written = commands(text)
+    assert not letters(written, "665", "IJK").any()
+    (follows,) = (note for note in export.notes if note.code.startswith("export.follows"))
+    delta = delta_of(machine, "Smoothieware")
+    there = 1e3 * apply(read_firmware_from_base(text), delta.positions)
+    ideal = DIALECTS["smoothie"](text, 0.0)
+    travel = 1e3 * (delta.readings - delta.ends)
+    off = np.linalg.norm(ideal.tool(ideal.homed + travel) - there, axis=1).max()
+    assert 0.1 < off <= 1.05 * follows.facts["largest"]
 
 
 @pytest.mark.parametrize("to", ["marlin", "reprap", "smoothie"])
@@ -226,13 +257,39 @@ def test_values_that_config_g_loads_count_where_their_file_is_beside_it(tmp_path
     assert read_printer(tmp_path / "config.g").radius == 100
 
 
-def test_points_of_smoothieware_are_the_nozzles_at_contact(tmp_path):
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("_trim_mm", "_trim"),  # until 2016
+        (
+            "gamma_max            300",
+            "endstop.minz.axis Z\nendstop.minz.homing_direction none\n"
+            "endstop.minz.homing_position 7\nendstop.maxz.axis Z\n"
+            "endstop.maxz.homing_direction home_to_max\nendstop.maxz.homing_position 300",
+        ),
+        ("gamma_max            300", "gamma_max 299\ngamma_max 300"),
+    ],
+)
+def test_older_and_newer_keys_of_smoothieware(old, new, tmp_path):
+    printer = read_printer(text_file(tmp_path, changed(CONFIG, old, new)))
+    np.testing.assert_allclose(printer.homed, read_printer(text_file(tmp_path, CONFIG)).homed)
+    assert not printer.remarks
+
+
+def test_the_third_tower_of_smoothieware_had_another_letter(tmp_path):
+    old = read_printer(text_file(tmp_path, changed(SMOOTHIE, " H0.3000", " F0.3000")))
+    np.testing.assert_allclose(old.angle, [210.2, 329.9, 90.3])
+
+
+def test_points_of_smoothieware_are_counted_from_the_third_carriage(tmp_path):
+    """G29.1 prints the carriage's height above the middle less the travel to contact."""
     printer = read_printer(text_file(tmp_path, CONFIG))
     a = np.deg2rad(60 * np.arange(6) + 30)
     want = np.column_stack([80 * np.cos(a), 80 * np.sin(a), 0.1 * np.arange(6)])
     want = np.vstack([want, [0, 0, -0.2]])
     text = "initial Bed ht is 295.000000 mm\ncenter probe: 0.0100\n"
-    text += "".join(f"< X{x:.4f} Y{y:.4f} Z{z:.4f}\n" for x, y, z in want)
+    start, carriage = 5.0, 5.0 + np.sqrt(printer.rod[2] ** 2 - printer.radius**2)
+    text += "".join(f"< X{x:.4f} Y{y:.4f} Z{carriage - (start - z):.4f}\n" for x, y, z in want)
     touches, _ = read_measured(text_file(tmp_path, text + "max delta: 0.7\n", "log.txt"), printer)
     ideal = Ideal(printer.radius, printer.angle, printer.rod, printer.homed)
     np.testing.assert_allclose(ideal.tool(touches.carriages), want, atol=1e-3)
@@ -311,7 +368,7 @@ def test_a_misspelt_name_of_a_needed_value_is_in_the_error(name, key, wrong, tmp
         ("klipper", "angle", "anlge"),
         ("klipper", "print_radius", "print_raduis"),
         ("marlin", "DELTA_ENDSTOP_ADJ", "DELTA_ENSTOP_ADJ"),
-        ("smoothie", "gamma_trim", "gama_trim"),
+        ("smoothie", "gamma_trim_mm", "gama_trim_mm"),
     ],
 )
 def test_a_misspelt_name_of_a_value_with_a_default_is_a_remark(name, key, wrong, tmp_path):

@@ -190,13 +190,16 @@ def fitted_settings(fit: Fit, least_offset: float = 0.0) -> Settings:
 
 @dataclass(frozen=True)
 class SettingNames:
-    """A firmware's names of its settings; of each tower angle, rod's trim and switch."""
+    """A firmware's names of its settings; of each tower angle, rod's trim and switch.
+
+    trims : none for a firmware with one length for all rods.
+    """
 
     rod: str
     radius: str
     height: str
     angles: tuple[str, str, str]
-    trims: tuple[str, str, str]
+    trims: tuple[str, ...]
     switches: tuple[str, str, str]
 
 
@@ -218,7 +221,7 @@ def named_settings(
         (names.radius, fit.radius, "mm"),
         (names.height, height + height_offset, "mm"),
         *zip(names.angles, fit.angle - np.array(TOWER_ANGLES), 3 * ["degrees"], strict=True),
-        *zip(names.trims, fit.rod - rod, 3 * ["mm"], strict=True),
+        *((name, trim, "mm") for name, trim in zip(names.trims, fit.rod - rod, strict=False)),
         *zip(names.switches, height - heights, 3 * ["mm"], strict=True),
     )
     return tuple(ExportedValue(name, float(value), unit) for name, value, unit in numbers)
