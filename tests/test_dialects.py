@@ -83,6 +83,31 @@ REPETIER = """\
 20:41:33.822 : EPR:3 937 -0.200 Corr. diagonal B [mm]
 20:41:33.825 : EPR:3 941 0.400 Corr. diagonal C [mm]
 """
+REPETIER_HEADER = """\
+#define DRIVE_SYSTEM 3
+#define STEPS_PER_ROTATION 200 // 1.8 degrees
+#define MICRO_STEPS 16
+#define AXIS_STEPS_PER_MM ((float)(MICRO_STEPS * STEPS_PER_ROTATION) / 40.0)
+#define ZAXIS_STEPS_PER_MM AXIS_STEPS_PER_MM
+#define Z_MAX_LENGTH 300
+#if DRIVE_SYSTEM == DELTA
+#define DELTA_DIAGONAL_ROD 270 // mm
+#define DELTA_ALPHA_A 210.2
+#define DELTA_ALPHA_B 329.9
+#define DELTA_ALPHA_C 90.3
+#define DELTA_DIAGONAL_CORRECTION_A 0.1
+#define DELTA_DIAGONAL_CORRECTION_B -0.2
+#define DELTA_DIAGONAL_CORRECTION_C 0.4
+#define DELTA_MAX_RADIUS 90
+#define PRINTER_RADIUS 160
+#define ROD_RADIUS (PRINTER_RADIUS-30-25)
+#define DELTA_X_ENDSTOP_OFFSET_STEPS 20
+#define DELTA_Y_ENDSTOP_OFFSET_STEPS 0
+#define DELTA_Z_ENDSTOP_OFFSET_STEPS 120
+#elif DRIVE_SYSTEM == TUGA
+#define DELTA_DIAGONAL_ROD 240
+#endif
+"""
 
 
 def text_file(folder, text, name="printer.txt"):
@@ -121,7 +146,13 @@ def test_a_firmware_goes_where_the_machine_goes(seed, to):
 
 
 @pytest.mark.parametrize(
-    ("text", "name"), [(SMOOTHIE, "smoothie"), (CONFIG, "smoothie"), (REPETIER, "repetier")]
+    ("text", "name"),
+    [
+        (SMOOTHIE, "smoothie"),
+        (CONFIG, "smoothie"),
+        (REPETIER, "repetier"),
+        (REPETIER_HEADER, "repetier"),
+    ],
 )
 def test_a_printer_is_read_and_written_back(text, name, tmp_path):
     printer = read_printer(text_file(tmp_path, text))
@@ -227,6 +258,14 @@ WRONG = {
         "where": "printer.txt, line 1",
         "found": "0",
         "expected": "above 0",
+    },
+    changed(REPETIER_HEADER, "SYSTEM 3", "SYSTEM 1"): {
+        "where": "printer.txt, line 1",
+        "found": "'DRIVE_SYSTEM 1'",
+    },
+    changed(REPETIER_HEADER, "ROD_RADIUS (", "ROD_RADUIS ("): {
+        "where": "printer.txt",
+        "found": "'ROD_RADUIS' in line 17",
     },
     f"EPR:3 {5000 * '8'} 1 x\n": {
         "where": "printer.txt",
@@ -397,6 +436,16 @@ def test_expressions_of_reprapfirmware_are_refused_with_what_to_write(line, tmp_
         read_printer(tmp_path / "config.g")
     assert "line 4" in caught.value.where
     assert f"Send {line.split()[0]} " in caught.value.next_step
+
+
+@pytest.mark.parametrize(("kind", "step"), [("6", True), ("10", False), ("1", False)])
+def test_other_kinematics_of_reprapfirmware_are_named(kind, step, tmp_path):
+    text = f"M584 X0 Y1 Z2\nM669 K3 ; a comment K4\n  M669 N4 K{kind} A0:-1600:-130\n"
+    with pytest.raises(InputError) as caught:
+        read_printer(text_file(tmp_path, text, "config.g"))
+    assert caught.value.where == "config.g, line 3"
+    assert caught.value.found == f"'M669 K{kind}'"
+    assert (caught.value.next_step is not None) == step
 
 
 REPRAP = "M665 L270.5:270.5:270.5 R105.5 H300.5 B90 X0.2 Y-0.1 Z0.3\nM666 X-0.25 Y0 Z-1.5 A0 B0\n"

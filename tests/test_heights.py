@@ -720,7 +720,10 @@ WRONG_POINTS = {
     MAP + "-10,10\n0.1\n": "the height map does not define its grid",
     MAP + "-10,10,-10,10,-1,0,10,3,3\n0.1,0.2,0.2\n": "a number above zero under xspacing",
     MAP + "-10,10,nan,10,-1,10,10,3,3\n0.1,0.2,0.2\n": "a number under ymin",
-    MAP + "-10,10,-10,10,-1,10,10,3,3\n0.1,high,0.2\n": "a height is no number",
+    MAP + "-10,10,-10,10,-1,10,10,3,1\n0.1,high,0.2\n": "row 1 of heights: a height is no number",
+    MAP + "-10,10,-10,10,-1,10,10,3,1\n0.1,nan,0.2\n": "found 'nan', expected millimetres",
+    MAP + "-10,10,-10,10,-1,10,10,3,3\n0.1,0.1,0.2\n": "found 1 rows, expected 3 rows of 3",
+    MAP + "-10,10,-10,10,-1,10,10,3,1\n0.1,0.1\n": "row 1 of heights: the height map is not com",
     "G30 P0 X0 Y0 Z-99999\nG32 bed probe heights: 0.1 0.2, mean 0.1\n": "do not belong together",
 }
 

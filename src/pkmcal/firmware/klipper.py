@@ -284,7 +284,7 @@ def _check_kinematics(config: KlipperConfig) -> None:
         where=where or f"{config.label}, [printer]",
         found=quoted(text),
         expected="kinematics: delta",
-        next_step="pkmcal new DIR --from FILE makes a session of this machine with a camera"
+        next_step="Make a session of this machine with a camera: pkmcal new DIR --from FILE"
         if text in ("rotary_delta", "winch")
         else None,
     )

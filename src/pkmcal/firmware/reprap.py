@@ -44,6 +44,7 @@ from pkmcal.firmware.contract import (
     Printer,
     Touches,
     WrittenValues,
+    printer_number,
     touches_at,
 )
 from pkmcal.wording import listed
@@ -64,6 +65,9 @@ _OWN_COMMAND = re.compile(
 )
 """Commands, or their words, that Marlin has not: M666 A and B are the bed's tilt."""
 _M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
+_KINEMATICS = re.compile(r"^[^\S\n]*M669\b[^;\n]*?\sK(\d+)", re.MULTILINE)
+LINEAR_DELTA, HANGPRINTER = "3", "6"
+"""Numbers of kinematics behind M669 K; without M669, M665 makes the printer a linear delta."""
 _PRINT_RADIUS = re.compile(r"^[^\S\n]*M665\b[^;\n]*\sB", re.MULTILINE)
 _OURS = re.compile(r"\s*M(?:66[56]|501)\b")
 HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
@@ -86,8 +90,8 @@ class RepRap(Firmware):
     rotary: ClassVar = linear
 
     def evidence(self, text: str, label: str) -> tuple[str, ...]:
-        """The file's name, or commands and words that this firmware alone has beside M665."""
-        if not _M665.search(text):
+        """The file's name, or commands and words that this firmware alone has beside M665 or M669."""
+        if not _M665.search(text) and not _KINEMATICS.search(text):
             return ()
         reasons = [f"it is called {label}"] if label.lower() in FILE_NAMES else []
         for n, line in enumerate(text.splitlines(), 1):
@@ -106,6 +110,17 @@ class RepRap(Firmware):
         Raises InputError for missing, malformed or impossible values.
         """
         label = path.name
+        for kind in list(_KINEMATICS.finditer(text))[-1:]:
+            if kind[1] != LINEAR_DELTA:
+                raise InputError(
+                    "heights of a bed are read of linear deltas",
+                    where=f"{label}, line {text.count(chr(10), 0, kind.start(1)) + 1}",
+                    found=quoted(f"M669 K{kind[1]}"),
+                    expected=f"M665, or M669 K{LINEAR_DELTA}",
+                    next_step="Make a session of a Hangprinter: pkmcal new DIR --from FILE"
+                    if kind[1] == HANGPRINTER
+                    else None,
+                )
         words, places, remarks = _checked_words(text, label, path.with_name(OVERRIDE))
         rod, radius, height = (
             _words(words, label, "665" + letter, size)
@@ -429,21 +444,29 @@ def _height_map_points(text: str, label: str) -> Array:
     x0, y0 = number_under("xmin", "min0"), number_under("ymin", "min1")
     dx = number_under("xspacing", "spacing0", "spacing", above=0.0)
     dy = number_under("yspacing", "spacing1", "spacing", above=0.0)
+    rows = [line.split(",") for line in lines[2:]]
+    size = tuple(
+        next((numbers[name] for name in names if name in numbers), "")
+        for names in (("xnum", "num0"), ("ynum", "num1"))
+    )
+    wrong = next((k for k, row in enumerate(rows, 1) if size[0] not in ("", str(len(row)))), None)
+    if wrong is not None or size[1] not in ("", str(len(rows))):
+        raise InputError(
+            "the height map is not complete",
+            where=label if wrong is None else f"{label}, row {wrong} of heights",
+            found=f"{len(rows)} rows" if wrong is None else f"{len(rows[wrong - 1])} heights",
+            expected=f"{size[1]} rows of {size[0]} heights, as line 3 has them",
+            next_step="Copy the whole file from the printer, or probe with G29 again",
+        )
     # RepRapFirmware writes a plain 0 for a point that was not probed
     out: list[tuple[float, float, float]] = []
-    for row, line in enumerate(lines[2:]):
-        for column, word in enumerate(line.split(",")):
+    for k, row in enumerate(rows):
+        for column, word in enumerate(row):
             if word.strip() in ("0", ""):
                 continue
-            try:
-                out.append((x0 + column * dx, y0 + row * dy, float(word)))
-            except ValueError:
-                raise InputError(
-                    "a height is no number",
-                    where=f"{label}, row {row + 1} of heights",
-                    found=word.strip(),
-                    expected="millimetres",
-                ) from None
+            place = f"{label}, row {k + 1} of heights"
+            z = printer_number(word.strip(), "a height", place, expected="millimetres")
+            out.append((x0 + column * dx, y0 + k * dy, z))
     return np.array(out).reshape(-1, 3)
 
 
