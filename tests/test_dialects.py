@@ -83,6 +83,11 @@ REPETIER = """\
 20:41:33.822 : EPR:3 937 -0.200 Corr. diagonal B [mm]
 20:41:33.825 : EPR:3 941 0.400 Corr. diagonal C [mm]
 """
+REPETIER_HOST = "".join(
+    re.sub(r".*EPR:(\d) (\d+) (\S+) (.*)", r'<epr pos="\2" type="\1" value="\3">\4</epr>', line)
+    for line in REPETIER.splitlines()
+)
+"""In one line, as Repetier-Host writes it."""
 REPETIER_HEADER = """\
 #define DRIVE_SYSTEM 3
 #define STEPS_PER_ROTATION 200 // 1.8 degrees
@@ -108,6 +113,11 @@ REPETIER_HEADER = """\
 #define DELTA_DIAGONAL_ROD 240
 #endif
 """
+
+
+def changed(text, old, new):
+    assert old in text
+    return text.replace(old, new)
 
 
 def text_file(folder, text, name="printer.txt"):
@@ -151,6 +161,10 @@ def test_a_firmware_goes_where_the_machine_goes(seed, to):
         (SMOOTHIE, "smoothie"),
         (CONFIG, "smoothie"),
         (REPETIER, "repetier"),
+        (
+            f"<?xml?><Repetier-Firmware-EEPROM>{REPETIER_HOST}</Repetier-Firmware-EEPROM>",
+            "repetier",
+        ),
         (REPETIER_HEADER, "repetier"),
     ],
 )
@@ -175,6 +189,34 @@ def test_a_printer_is_read_and_written_back(text, name, tmp_path):
     again = read_printer(text_file(tmp_path, out, "again.txt"))
     assert again.firmware.name == name
     np.testing.assert_allclose(again.homed, want, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        changed(SMOOTHIE, "A0.0000 B0.0000", "A-0.4200 B0.9800"),
+        changed(REPETIER, "913 0.000 Delta Radius A(0):", "913 -0.420 x\nEPR:3 917 0.980 x"),
+    ],
+)
+def test_towers_with_radii_of_their_own_are_on_one_circle_elsewhere(text, tmp_path):
+    """The session's machine goes as the firmware commands, but for the middle of its frame."""
+    printer = read_printer(text_file(tmp_path, text))
+    radius = 105.0 + np.array([-0.42, 0.98, 0.0])
+    np.testing.assert_allclose(
+        printer.homed, 300 + np.sqrt(printer.rod**2 - radius**2) + [0.25, 0, 1.5], atol=1e-9
+    )
+    points = np.array([[0.0, 0.0, 0.0], [60.0, 20.0, 0.0], [-30.0, 50.0, 40.0], [0, -70.0, 90.0]])
+    a = np.deg2rad([210.2, 329.9, 90.3])
+    towers = radius[:, None] * np.column_stack([np.cos(a), np.sin(a)])
+    away = np.linalg.norm(points[:, None, :2] - towers, axis=-1)
+    carriages = points[:, 2:] + np.sqrt(printer.rod**2 - away**2)
+    np.testing.assert_allclose(printer.carriages(points), carriages, atol=1e-9)
+    machine = load_mechanism(text_file(tmp_path, nominal_text(printer), "m.yaml"))
+    there = 1e3 * machine.forward(1e-3 * carriages)[:, :3, 3]
+    shift = there - points
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[:1], shift.shape), atol=1e-3)
+    assert abs(shift[0, 2]) < 1e-3
+    assert 0.3 < np.linalg.norm(shift[0, :2]) < 1
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -210,21 +252,11 @@ def test_repetier_needs_motor_steps():
     assert caught.value.found == "no steps_per_mm"
 
 
-def changed(text, old, new):
-    assert old in text
-    return text.replace(old, new)
-
-
 WRONG = {
     changed(SMOOTHIE, "M665 Z299.500", ""): {
         "where": "printer.txt",
         "expected": "the lines M665 that M503 prints, with L, R and Z, or arm_length, "
         "arm_radius and gamma_max",
-    },
-    changed(SMOOTHIE, "A0.0000", "A0.5"): {
-        "where": "printer.txt, line 4",
-        "found": "0.5",
-        "expected": "0",
     },
     changed(SMOOTHIE, "R105.0000", "Rnan"): {
         "where": "printer.txt, line 4",
@@ -240,14 +272,13 @@ WRONG = {
         "found": "'inf'",
         "expected": "a number in mm, or degrees",
     },
+    changed(REPETIER_HOST, '"105.000"', '"105,0"'): {
+        "where": "printer.txt, line 1",
+        "found": '\'<epr pos="885" type="3" value="105,0">\'',
+    },
     changed(REPETIER, "EPR:3 153", "EPR:3 154"): {
         "where": "printer.txt",
         "expected": "a line EPR: with 153 and a number, as M205 prints it",
-    },
-    changed(REPETIER, "913 0.000", "913 0.100"): {
-        "where": "printer.txt, line 12",
-        "found": "0.1",
-        "expected": "0",
     },
     changed(REPETIER, "EPR:3 885 105.000", "EPR:3 885 1e9"): {
         "where": "printer.txt, line 4",
@@ -263,7 +294,11 @@ WRONG = {
         "where": "printer.txt, line 1",
         "found": "'DRIVE_SYSTEM 1'",
     },
-    changed(REPETIER_HEADER, "ROD_RADIUS (", "ROD_RADUIS ("): {
+    changed(REPETIER_HEADER, "#define ROD_RADIUS (P", "#define END_EFFECTOR_OFFSET (P"): {
+        "where": "printer.txt",
+        "expected": "#define END_EFFECTOR_HORIZONTAL_OFFSET with a number",
+    },
+    changed(REPETIER_HEADER, "PRINTER_RADIUS", "P").replace("ROD_RADIUS (", "ROD_RADUIS ("): {
         "where": "printer.txt",
         "found": "'ROD_RADUIS' in line 17",
     },

@@ -2,11 +2,12 @@
 as M206 by ``export --to repetier``.
 
 Semantics: Repetier-Firmware's Printer.cpp (homeZAxis, updateDerivedParameter) and Eeprom.cpp. Lines
-are ``EPR:type position value name``. The towers stand at the angles Alpha A, B and C on one circle,
-plus a correction of the radius for each, which is 0 here; rods have a correction of the length
-each. With the nozzle in the middle at Z max length, after homing, a carriage is lower than its
-switch by its endstop offset, in motor steps: the switch triggers at ``Z max length + sqrt(rod^2 -
-radius^2) + offset / steps per mm``.
+are ``EPR:type position value name``, and ``<epr pos="position" type="type" value="value">`` in
+Repetier-Host's files .epr. The towers stand at the angles Alpha A, B and C on one circle, plus a
+correction of the radius for each, which is written as 0; rods have a correction of the length each.
+With the nozzle in the middle at Z max length, after homing, a carriage is lower than its switch by
+its endstop offset, in motor steps: the switch triggers at ``Z max length + sqrt(rod^2 - radius^2) +
+offset / steps per mm``.
 
 ``Z-probe:10.66 X:0.00 Y:0.00`` of G29, G30 and G33 (Printer.cpp, runZProbe) is how far the probe
 moved down, with corrections, from a height that is not printed and depends on the version: such
@@ -85,9 +86,12 @@ HEADER = {
     },
 }
 """Positions in the EEPROM by names of Configuration.h."""
+OLD_RADIUS = ("PRINTER_RADIUS", "END_EFFECTOR_HORIZONTAL_OFFSET", "CARRIAGE_HORIZONTAL_OFFSET")
+"""Names whose difference is ROD_RADIUS where that is not defined."""
 _HEADER = re.compile(r"^[^\S\n]*#[^\S\n]*define[^\S\n]+(DELTA_ALPHA_A|ROD_RADIUS)\b", re.MULTILINE)
 _EEPROM = re.compile(r"\bEPR:(\d+) (\d+) (\S+)(?: (.{0,60}))?")
 _TRAVEL = re.compile(r"\bZ-probe: ?-?\d{1,4}\.\d{1,6} X:[^\n]{0,60}")
+_HOST = re.compile(r'<epr pos="(\d+)" type="(\d+)" value="([^"<]*)">')
 _WRITTEN = re.compile(r"M206 T(\d) P(\d+) [SX](\S+)(?: ; (.*))?")
 
 
@@ -98,7 +102,9 @@ class Repetier(Firmware):
     name: ClassVar = "repetier"
     title: ClassVar = "Repetier-Firmware: commands to send"
     program: ClassVar = "Repetier-Firmware"
-    configuration: ClassVar = "the lines EPR: of M205, or Configuration.h (Repetier-Firmware)"
+    configuration: ClassVar = (
+        "the lines EPR: of M205, .epr, or Configuration.h (Repetier-Firmware)"
+    )
     file: ClassVar = "pkmcal_repetier.gcode"
     carriage_source: ClassVar = "what M114\nprints, turned into motors by its values"
 
@@ -108,10 +114,10 @@ class Repetier(Firmware):
         if define := _HEADER.search(text):
             return (f"line {text.count(chr(10), 0, define.start()) + 1} defines {define[1]}",)
         for n, line in enumerate(text.splitlines(), 1):
-            for pattern in (_EEPROM, _WRITTEN):
-                match = pattern.search(line)
-                if match and match.group(1, 2) == (str(FLOAT), str(ROD)):
-                    return (f"line {n} has the EEPROM's rod length, {ROD}",)
+            typed = [match.group(1, 2) for p in (_EEPROM, _WRITTEN) for match in p.finditer(line)]
+            typed += [match.group(2, 1) for match in _HOST.finditer(line)]
+            if (str(FLOAT), str(ROD)) in typed:
+                return (f"line {n} has the EEPROM's rod length, {ROD}",)
         return ()
 
     def printer(self, text: str, path: Path) -> Printer:
@@ -232,6 +238,10 @@ def _eeprom(text: str, label: str) -> Words:
     for n, line in enumerate(text.splitlines(), 1):
         match = _EEPROM.search(line) or _WRITTEN.match(line.strip())
         where, what = f"{label}, line {n}", "a value of this line"
+        expected = "a number in mm, degrees or steps"
+        for one in _HOST.finditer(line):
+            value = printer_number(one[3], what, where, line=one[0], expected=expected)
+            out[one[1]] = value, where
         if match is None:
             if "EPR:" in line:
                 raise InputError(
@@ -241,7 +251,6 @@ def _eeprom(text: str, label: str) -> Words:
                     expected="EPR:, the type, the position and a number, as M205 prints them",
                 )
             continue
-        expected = "a number in mm, degrees or steps"
         value = printer_number(match[3], what, where, line=match[0], expected=expected)
         out[match[2]] = value, where
     return out
@@ -262,7 +271,13 @@ def _header(text: str, label: str) -> Words:
             expected=f"DRIVE_SYSTEM DELTA, or {DELTA}",
         )
     needed = {str(position) for position in NEEDED}
-    return {
+    if "ROD_RADIUS" not in values.by_name and OLD_RADIUS[0] in values.by_name:
+        outer, *inner = (float(values.numbers(name, 1)[0]) for name in OLD_RADIUS)
+        radius = {str(RADIUS): (outer - sum(inner), values.place(OLD_RADIUS[0]))}
+        needed -= radius.keys()
+    else:
+        radius = Words()
+    return radius | {
         str(position): (float(values.numbers(name, 1)[0]), values.place(name))
         for name, position in HEADER.items()
         if name in values.by_name or str(position) in needed
@@ -287,7 +302,7 @@ def _settings(eeprom: Words, label: str) -> Settings:
         value, place = eeprom.get(str(position), (1.0, ""))
         if value <= 0:
             raise impossible(place, f"the EEPROM's value {position}", value, "above 0")
-    for position in (*RADIUS_CORRECTIONS, *ZERO_POSITIONS):
+    for position in ZERO_POSITIONS:
         value, place = eeprom.get(str(position), (0.0, ""))
         if value:
             raise impossible(
@@ -299,6 +314,7 @@ def _settings(eeprom: Words, label: str) -> Settings:
     return Settings(
         rod=eeprom[str(ROD)][0] + values(ROD_CORRECTIONS),
         radius=eeprom[str(RADIUS)][0],
+        radius_trims=values(RADIUS_CORRECTIONS),
         angle=values(ANGLES),
         offset=-values(SWITCHES) / steps,
         height=eeprom[str(HEIGHT)][0],

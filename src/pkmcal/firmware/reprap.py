@@ -90,7 +90,7 @@ class RepRap(Firmware):
     rotary: ClassVar = linear
 
     def evidence(self, text: str, label: str) -> tuple[str, ...]:
-        """The file's name, or commands and words that this firmware alone has beside M665 or M669."""
+        """The file's name, or words of this firmware alone, beside M665 or M669."""
         if not _M665.search(text) and not _KINEMATICS.search(text):
             return ()
         reasons = [f"it is called {label}"] if label.lower() in FILE_NAMES else []

@@ -226,15 +226,16 @@ def _settings(words: Words, label: str, names: Mapping[str, str] = EMPTY) -> Set
     for name in ("665L", "665R", "665Z", "92X", "92Y", "92Z"):
         if name in words and words[name][0] <= 0:
             raise impossible(words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "above 0")
-    for name in (*("665" + c for c in RADIUS_LETTERS), "206X", "206Y"):
+    for name in ("206X", "206Y"):
         if words.get(name, (0.0, ""))[0]:
             raise impossible(
                 words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "0",
-                "Set it to 0, home, and probe again: towers' angles take its place",
+                "Set it to 0, home, and probe again",
             )  # fmt: skip
     return Settings(
         rod=words["665L"][0] + values("665", ROD_LETTERS),
         radius=words["665R"][0],
+        radius_trims=values("665", RADIUS_LETTERS),
         angle=np.array(TOWER_ANGLES) + values("665", ANGLE_LETTERS),
         offset=values("666", "XYZ"),
         height=words["665Z"][0] + words.get("206Z", (0.0, ""))[0],
