@@ -713,6 +713,27 @@ def test_what_no_reprapfirmware_printer_has_is_refused_with_its_line(letter, val
 
 
 MAP = "RepRapFirmware height map file v2\nxmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum\n"
+
+
+@pytest.mark.parametrize("override", [False, True])
+def test_the_tool_is_beside_the_probe_of_reprapfirmware(override, tmp_path):
+    """Places of a map and of G30 are those under the probe, by G31 at the nozzle plus X and Y."""
+    config = "M665 L270:270:270 R105 H300\nM666 X0 Y0 Z0\nG31 P500 X20 Y-5 Z2.5 ; X1\n"
+    (tmp_path / "config-override.g").write_text("G31 K0 P500 X-12.0\n" if override else "")
+    path = text_file(tmp_path, config + "M501\n", "config.g")
+    places = [(0, 0), (60, 0), (-60, 0), (0, 60), (0, -60), (40, 40), (-40, -40)]
+    log = "".join(f"G30 P{k} X{x} Y{y} Z-99999\n" for k, (x, y) in enumerate(places))
+    log += "G32 bed probe heights:" + 7 * " 0.100" + ", mean 0.1\n"
+    printer = read_printer(path)
+    tool = np.array([(x - (-12 if override else 20), y + 5, 0.1) for x, y in places])
+    touches, _ = read_measured(text_file(tmp_path, log), printer)
+    np.testing.assert_allclose(touches.carriages, printer.carriages(tool), atol=1e-9)
+    path.write_text(config.replace("X20", "X{global.dx}"))
+    with pytest.raises(InputError) as caught:
+        read_measured(text_file(tmp_path, log), read_printer(path))
+    assert caught.value.where == "config.g"
+
+
 WRONG_POINTS = {
     "ok\n": "there is no point of a bed in this file",
     "probe at 300.000,0.000 is z=0.1\n": "the printer does not reach this point",

@@ -102,9 +102,7 @@ class Repetier(Firmware):
     name: ClassVar = "repetier"
     title: ClassVar = "Repetier-Firmware: commands to send"
     program: ClassVar = "Repetier-Firmware"
-    configuration: ClassVar = (
-        "the lines EPR: of M205, .epr, or Configuration.h (Repetier-Firmware)"
-    )
+    configuration: ClassVar = "the lines EPR: of M205, .epr, or Configuration.h (Repetier-Firmware)"
     file: ClassVar = "pkmcal_repetier.gcode"
     carriage_source: ClassVar = "what M114\nprints, turned into motors by its values"
 

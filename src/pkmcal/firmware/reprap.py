@@ -9,7 +9,9 @@ arm at the larger angle of A plus its adjustment. B is the print radius, beyond 
 accepts no position; if omitted it remains as it was, 80 mm by default.
 
 ``G29`` writes heightmap.csv, and a sequence of ``G30 Pn X Y Z-99999`` that ends with S-1 prints
-``G32 bed probe heights: ...``: tool heights at contact.
+``G32 bed probe heights: ...``: places under the probe, with the tool's height when its tip would
+touch the bed there. The tool is beside them by X and Y of ``G31`` (GCodes4.cpp, gridProbing;
+Move.cpp, GetProbeCoordinates).
 """
 
 from __future__ import annotations
@@ -73,6 +75,8 @@ _OURS = re.compile(r"\s*M(?:66[56]|501)\b")
 HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
 _G30 = re.compile(r"^[^\S\n]*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
 _G30_WORD = re.compile(rf"([PXY])\s*{NUMBER}", re.IGNORECASE)
+_G31 = re.compile(r"^[^\S\n]*G31\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
+_G31_WORD = re.compile(r"([XY])\s*(-?[0-9.]+|\{)", re.IGNORECASE)
 _HEIGHTS = re.compile(rf"bed probe heights:((?:\s+{NUMBER})+)", re.IGNORECASE)
 
 
@@ -155,6 +159,7 @@ class RepRap(Firmware):
             homed=ends,
             reach=None if reach is None else float(reach[0]),
             carriages=partial(reprap_carriage_heights, command),
+            offset=_probe_offset(text, path.with_name(OVERRIDE)),
             step=CARRIAGE_STEP if steps is None else float(1 / steps.min()),
             steps=steps,
             remarks=remarks,
@@ -163,12 +168,23 @@ class RepRap(Firmware):
     def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
         """Points of a height map, or of lines G30 with the heights that they printed."""
         label = path.name
+        values = _HEIGHTS.findall(text)
         if text.startswith(HEIGHT_MAP_TITLE):
-            return touches_at(_height_map_points(text, label), 0.0, printer, label)
-        if values := _HEIGHTS.findall(text):
+            points = _height_map_points(text, label)
+        elif values:
             points = _sequence_points(text, label, values[-1][0])
-            return touches_at(points, 0.0, printer, label)
-        return None
+        else:
+            return None
+        if not np.isfinite(printer.offset[:2]).all():
+            raise InputError(
+                "where the probe is beside the nozzle is not known",
+                where=printer.label,
+                found="G31 with an expression in braces",
+                expected="G31 with X and Y in mm",
+                next_step="Write these numbers into a copy of that line; G31 without values prints"
+                " them",
+            )
+        return touches_at(points - [*printer.offset[:2], 0.0], 0.0, printer, label)
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header of comments."""
@@ -363,6 +379,23 @@ def _checked_words(
         words.update({name.upper(): values for name, values in value.items()})
         places.update({name.upper(): f"{label}, line {n}" for name in value})
     return words, places, remarks
+
+
+def _probe_offset(text: str, override: Path) -> tuple[float, float, float]:
+    """Offset (x, y, 0) of the probe from the nozzle, mm, by the last G31 with each; zeros without.
+
+    NaN where an expression gives it. override : file that M501 loads, whose values count.
+    """
+    if any(line.split()[:1] == ["M501"] for line in text.splitlines()) and override.is_file():
+        text += "\n" + read_text(override)
+    out = {"X": 0.0, "Y": 0.0}
+    for words in _G31.findall(text):
+        for letter, number in _G31_WORD.findall(words):
+            try:
+                out[letter.upper()] = float(number)
+            except ValueError:
+                out[letter.upper()] = np.nan
+    return out["X"], out["Y"], 0.0
 
 
 def _steps_per_mm(text: str, label: str) -> Array | None:
