@@ -21,7 +21,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, missing_value
 
-NONE_KNOWN: Mapping[str, str] = MappingProxyType(dict[str, str]())
+NO_CONSTANTS: Mapping[str, str] = MappingProxyType(dict[str, str]())
 LONGEST_EXPRESSION = 200
 """Bound on the characters of a value or a condition."""
 DEEPEST_DEFINITION = 10
@@ -83,13 +83,13 @@ def _code_lines(text: str) -> Iterator[tuple[int, str]]:
         yield n, "".join(code).strip()
 
 
-def active_definitions(text: str, known: Mapping[str, str] = NONE_KNOWN) -> Iterator[Define]:
+def active_definitions(text: str, constants: Mapping[str, str] = NO_CONSTANTS) -> Iterator[Define]:
     """Definitions that hold: not commented out, and in no branch of a condition that is false.
 
-    A condition that cannot be evaluated may hold, and so may all branches after it. known : values
+    A condition that cannot be evaluated may hold, and so may all branches after it. constants : values
     by name of what another header defines.
     """
-    values = dict(known)
+    values = dict(constants)
     # of each enclosing condition: whether this branch holds, and whether one before it did; None
     # where unknown
     branches: list[tuple[bool | None, bool | None]] = []
@@ -154,7 +154,7 @@ class Definitions:
     """Definitions of a header.
 
     by_name : all that may hold, in the order of the file. label : the file's name, for messages.
-    legal : the names that are read. known : as for :func:`active_definitions`.
+    legal : the names that are read. constants : as for :func:`active_definitions`.
     """
 
     def __init__(
@@ -162,11 +162,11 @@ class Definitions:
         text: str,
         label: str,
         legal: Collection[str] = (),
-        known: Mapping[str, str] = NONE_KNOWN,
+        constants: Mapping[str, str] = NO_CONSTANTS,
     ) -> None:
         self.label, self.legal = label, legal
         self.by_name: dict[str, list[Define]] = {}
-        for define in active_definitions(text, known):
+        for define in active_definitions(text, constants):
             self.by_name.setdefault(define.name, []).append(define)
         self._results: dict[str, float] = {}
 
