@@ -86,8 +86,9 @@ def _code_lines(text: str) -> Iterator[tuple[int, str]]:
 def active_definitions(text: str, constants: Mapping[str, str] = NO_CONSTANTS) -> Iterator[Define]:
     """Definitions that hold: not commented out, and in no branch of a condition that is false.
 
-    A condition that cannot be evaluated may hold, and so may all branches after it. constants : values
-    by name of what another header defines.
+    A condition that cannot be evaluated may hold, and so may all branches after it.
+
+    constants : values by name of what another header defines.
     """
     values = dict(constants)
     # of each enclosing condition: whether this branch holds, and whether one before it did; None
