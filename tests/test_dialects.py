@@ -4,6 +4,7 @@ and Repetier-Firmware's files.
 
 from __future__ import annotations
 
+import codecs
 import re
 from dataclasses import replace
 
@@ -504,6 +505,29 @@ def test_a_damaged_value_is_no_default(name, text, line, tmp_path):
     with pytest.raises(InputError) as caught:
         read_printer(text_file(tmp_path, text, name))
     assert caught.value.where == (name if line is None else f"{name}, line {line}")
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"EPR:1 294 210 Extr.1 Preheat temp. [\xb0C]\r\n" + REPETIER.encode(),
+        REPETIER.encode("utf-16"),
+        codecs.BOM_UTF16_BE + REPETIER.replace("\n", "\r\n").encode("utf-16-be"),
+        codecs.BOM_UTF8 + REPETIER.encode(),
+    ],
+)
+def test_logs_in_the_encodings_of_hosts_and_shells(raw, tmp_path):
+    """A degree sign in Latin-1, as firmwares print it, and what Windows' shell saves."""
+    (tmp_path / "eeprom.txt").write_bytes(raw)
+    assert read_printer(tmp_path / "eeprom.txt").radius == 105.0
+
+
+@pytest.mark.parametrize("raw", [b"\x89PNG\r\n", bytes(range(256)), REPETIER.encode("utf-16-le")])
+def test_what_is_no_text_is_no_printer(raw, tmp_path):
+    (tmp_path / "eeprom.txt").write_bytes(raw)
+    with pytest.raises(InputError) as caught:
+        read_printer(tmp_path / "eeprom.txt")
+    assert caught.value.code == "file.not_text"
 
 
 def test_printers_in_metres_are_refused(tmp_path):
