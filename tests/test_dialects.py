@@ -277,6 +277,12 @@ WRONG = {
         "where": "printer.txt, line 1",
         "found": '\'<epr pos="885" type="3" value="105,0">\'',
     },
+    changed(REPETIER, "913 0.000", "913 0.100")
+    .replace("210.200", "329.900")
+    .replace("933 0.100", "917 0.100 x\nEPR:3 933 0.100"): {
+        "where": "printer.txt",
+        "found": "329.9, 329.9, 90.3 degrees",
+    },
     changed(REPETIER, "EPR:3 153", "EPR:3 154"): {
         "where": "printer.txt",
         "expected": "a line EPR: with 153 and a number, as M205 prints it",
@@ -528,6 +534,13 @@ def test_what_is_no_text_is_no_printer(raw, tmp_path):
     with pytest.raises(InputError) as caught:
         read_printer(tmp_path / "eeprom.txt")
     assert caught.value.code == "file.not_text"
+
+
+def test_a_print_radius_beyond_the_rods_is_refused(tmp_path):
+    printer = read_printer(text_file(tmp_path, changed(REPETIER, "925 90.000", "925 9000")))
+    with pytest.raises(InputError) as caught:
+        nominal_text(printer)
+    assert caught.value.where == "printer.txt"
 
 
 def test_printers_in_metres_are_refused(tmp_path):

@@ -78,7 +78,8 @@ class Settings:
     def printer(self, firmware: Firmware, label: str) -> Printer:
         """The printer of these values; label : name of its file.
 
-        Towers on circles of their own stand on one circle about another middle.
+        Towers on circles of their own stand on one circle about another middle. Raises InputError
+        for towers on a line.
         """
         with np.errstate(invalid="ignore"):
             homed = switch_heights(self)
@@ -86,6 +87,13 @@ class Settings:
         if self.radius_trims.any():
             towers = tower_places(self)
             chords = towers[1:] - towers[0]
+            if np.linalg.matrix_rank(chords) < 2:
+                raise InputError(
+                    "the towers stand on one line",
+                    where=label,
+                    found=", ".join(f"{a:g}" for a in self.angle) + " degrees",
+                    expected="three directions about 120 degrees apart",
+                )
             middle = np.linalg.solve(2 * chords, np.sum(chords**2, axis=1))
             radius = float(np.linalg.norm(middle))
             x, y = (towers - towers[0] - middle).T
