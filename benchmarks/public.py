@@ -43,7 +43,7 @@ CAMERA_NAMES = (
     "*chain.yaml",
 )  # fmt: skip
 PRINTER_NAMES = (
-    "printer*.cfg", "*delta*.cfg", "*kossel*.cfg", "config.g", "Configuration.h", "config",
+    "printer*.cfg", "*delta*.cfg", "*kossel*.cfg", "config.g", "Configuration.h", "config", "*.epr",
 )  # fmt: skip
 COLUMNS = "file", "kind", "verdict", "codes", "right"
 

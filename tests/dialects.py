@@ -92,10 +92,10 @@ def marlin(text, height_offset, ignored=6 / 40):
 
 
 def smoothie(text, _):
-    """A negative trim is a switch that triggers higher."""
+    """A negative trim is a switch that triggers higher; I, J and K are ignored."""
     values = commands(text)
     angle = np.array([210.0, 330.0, 90.0]) + letters(values, "665", "DEH")
-    radius, rod = values["665R"], values["665L"] + letters(values, "665", "IJK")
+    radius, rod = values["665R"], np.full(3, values["665L"])
     assert not letters(values, "665", "ABC").any()
     height = values["665Z"] + values["206Z"]
     homed = height + np.sqrt(rod**2 - radius**2) - letters(values, "666", "XYZ")
@@ -123,14 +123,19 @@ HEIGHT_OFFSET = -16.0
 STEPS = 80.0
 
 
-def perturbed(seed, scale=(1.0, 1.0, 1.0)):
-    """A printer that every firmware's values can describe, with entries that exports keep."""
+def perturbed(seed, scale=(1.0, 1.0, 1.0), to=""):
+    """A printer that a firmware's values can describe, with entries that exports keep.
+
+    Smoothieware has one length for all rods.
+    """
     rng = np.random.default_rng(seed)
     settings = printers.Settings(
         radius=105 + rng.normal(),
         angle=tuple(np.array([210, 330, 90]) + 0.5 * rng.normal(size=3)),
         rod=tuple(270 + 0.5 * rng.normal(size=3)),
     )
+    if to == "smoothie":
+        settings = replace(settings, rod=3 * settings.rod[:1])
     machine = printers.machine(settings, scale=scale, endstops=0.7 * rng.normal(size=3))
     entries = {"height_offset": 1e-3 * HEIGHT_OFFSET, "steps_per_mm": 3 * (STEPS,)}
     return replace(machine, document=machine.document.model_copy(update=entries)), rng

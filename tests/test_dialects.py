@@ -4,17 +4,29 @@ and Repetier-Firmware's files.
 
 from __future__ import annotations
 
+import codecs
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import printers
-from dialects import DIALECTS, HEIGHT_OFFSET, STEPS, Ideal, carried, commands, perturbed
+from dialects import (
+    DIALECTS,
+    HEIGHT_OFFSET,
+    STEPS,
+    Ideal,
+    carried,
+    commands,
+    letters,
+    perturbed,
+)
 from export_sources import source_of
 from faults import raises
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import make_export
+from pkmcal.exporters.delta import delta_of
 from pkmcal.exporters.delta_texts import read_firmware_from_base
 from pkmcal.firmware.contract import firmwares, read_printer
 from pkmcal.firmware.probed import read_measured
@@ -51,8 +63,8 @@ delta_tower3_angle 0.3
 alpha_steps_per_mm   80
 beta_steps_per_mm    80
 gamma_steps_per_mm   100
-alpha_trim -0.25
-gamma_trim -1.5
+alpha_trim_mm -0.25
+gamma_trim_mm -1.5
 gamma_max            300
 """
 REPETIER = """\
@@ -72,6 +84,41 @@ REPETIER = """\
 20:41:33.822 : EPR:3 937 -0.200 Corr. diagonal B [mm]
 20:41:33.825 : EPR:3 941 0.400 Corr. diagonal C [mm]
 """
+REPETIER_HOST = "".join(
+    re.sub(r".*EPR:(\d) (\d+) (\S+) (.*)", r'<epr pos="\2" type="\1" value="\3">\4</epr>', line)
+    for line in REPETIER.splitlines()
+)
+"""In one line, as Repetier-Host writes it."""
+REPETIER_HEADER = """\
+#define DRIVE_SYSTEM 3
+#define STEPS_PER_ROTATION 200 // 1.8 degrees
+#define MICRO_STEPS 16
+#define AXIS_STEPS_PER_MM ((float)(MICRO_STEPS * STEPS_PER_ROTATION) / 40.0)
+#define ZAXIS_STEPS_PER_MM AXIS_STEPS_PER_MM
+#define Z_MAX_LENGTH 300
+#if DRIVE_SYSTEM == DELTA
+#define DELTA_DIAGONAL_ROD 270 // mm
+#define DELTA_ALPHA_A 210.2
+#define DELTA_ALPHA_B 329.9
+#define DELTA_ALPHA_C 90.3
+#define DELTA_DIAGONAL_CORRECTION_A 0.1
+#define DELTA_DIAGONAL_CORRECTION_B -0.2
+#define DELTA_DIAGONAL_CORRECTION_C 0.4
+#define DELTA_MAX_RADIUS 90
+#define PRINTER_RADIUS 160
+#define ROD_RADIUS (PRINTER_RADIUS-30-25)
+#define DELTA_X_ENDSTOP_OFFSET_STEPS 20
+#define DELTA_Y_ENDSTOP_OFFSET_STEPS 0
+#define DELTA_Z_ENDSTOP_OFFSET_STEPS 120
+#elif DRIVE_SYSTEM == TUGA
+#define DELTA_DIAGONAL_ROD 240
+#endif
+"""
+
+
+def changed(text, old, new):
+    assert old in text
+    return text.replace(old, new)
 
 
 def text_file(folder, text, name="printer.txt"):
@@ -98,7 +145,7 @@ def test_the_forward_kinematics_in_known_places():
 @pytest.mark.parametrize("to", DIALECTS)
 @pytest.mark.parametrize("seed", range(20))
 def test_a_firmware_goes_where_the_machine_goes(seed, to):
-    machine, rng = perturbed(seed)
+    machine, rng = perturbed(seed, to=to)
     (text,) = make_export(source_of(machine), to).files.values()
     ideal = DIALECTS[to](text, HEIGHT_OFFSET)
     travel = carried(machine, rng)
@@ -110,7 +157,17 @@ def test_a_firmware_goes_where_the_machine_goes(seed, to):
 
 
 @pytest.mark.parametrize(
-    ("text", "name"), [(SMOOTHIE, "smoothie"), (CONFIG, "smoothie"), (REPETIER, "repetier")]
+    ("text", "name"),
+    [
+        (SMOOTHIE, "smoothie"),
+        (CONFIG, "smoothie"),
+        (REPETIER, "repetier"),
+        (
+            f"<?xml?><Repetier-Firmware-EEPROM>{REPETIER_HOST}</Repetier-Firmware-EEPROM>",
+            "repetier",
+        ),
+        (REPETIER_HEADER, "repetier"),
+    ],
 )
 def test_a_printer_is_read_and_written_back(text, name, tmp_path):
     printer = read_printer(text_file(tmp_path, text))
@@ -122,6 +179,9 @@ def test_a_printer_is_read_and_written_back(text, name, tmp_path):
     want = 300 + np.sqrt(printer.rod**2 - 105**2) + [0.25, 0.0, 1.5]
     np.testing.assert_allclose(printer.homed, want)
     assert printer.reach == (90.0 if name == "repetier" else None)
+    if name == "smoothie":  # rods of one length, as it has without builds of a pull request
+        printer = replace(printer, rod=np.full(3, 270.0))
+        want = printer.homed
     machine = load_mechanism(text_file(tmp_path, nominal_text(printer), "m.yaml"))
     (out,) = make_export(source_of(machine), name).files.values()
     ideal = DIALECTS[name](out, 0.0)
@@ -130,6 +190,51 @@ def test_a_printer_is_read_and_written_back(text, name, tmp_path):
     again = read_printer(text_file(tmp_path, out, "again.txt"))
     assert again.firmware.name == name
     np.testing.assert_allclose(again.homed, want, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        changed(SMOOTHIE, "A0.0000 B0.0000", "A-0.4200 B0.9800"),
+        changed(REPETIER, "913 0.000 Delta Radius A(0):", "913 -0.420 x\nEPR:3 917 0.980 x"),
+    ],
+)
+def test_towers_with_radii_of_their_own_are_on_one_circle_elsewhere(text, tmp_path):
+    """The session's machine goes as the firmware commands, but for the middle of its frame."""
+    printer = read_printer(text_file(tmp_path, text))
+    radius = 105.0 + np.array([-0.42, 0.98, 0.0])
+    np.testing.assert_allclose(
+        printer.homed, 300 + np.sqrt(printer.rod**2 - radius**2) + [0.25, 0, 1.5], atol=1e-9
+    )
+    points = np.array([[0.0, 0.0, 0.0], [60.0, 20.0, 0.0], [-30.0, 50.0, 40.0], [0, -70.0, 90.0]])
+    a = np.deg2rad([210.2, 329.9, 90.3])
+    towers = radius[:, None] * np.column_stack([np.cos(a), np.sin(a)])
+    away = np.linalg.norm(points[:, None, :2] - towers, axis=-1)
+    carriages = points[:, 2:] + np.sqrt(printer.rod**2 - away**2)
+    np.testing.assert_allclose(printer.carriages(points), carriages, atol=1e-9)
+    machine = load_mechanism(text_file(tmp_path, nominal_text(printer), "m.yaml"))
+    there = 1e3 * machine.forward(1e-3 * carriages)[:, :3, 3]
+    shift = there - points
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[:1], shift.shape), atol=1e-3)
+    assert abs(shift[0, 2]) < 1e-3
+    assert 0.3 < np.linalg.norm(shift[0, :2]) < 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rods_of_different_lengths_are_one_for_smoothieware(seed):
+    """It has one length: the best one is written, and the error that remains is stated."""
+    machine, _ = perturbed(seed)
+    export = make_export(source_of(machine), "smoothie")
+    (text,) = export.files.values()
+    written = commands(text)
+    assert not letters(written, "665", "IJK").any()
+    (follows,) = (note for note in export.notes if note.code.startswith("export.follows"))
+    delta = delta_of(machine, "Smoothieware")
+    there = 1e3 * apply(read_firmware_from_base(text), delta.positions)
+    ideal = DIALECTS["smoothie"](text, 0.0)
+    travel = 1e3 * (delta.readings - delta.ends)
+    off = np.linalg.norm(ideal.tool(ideal.homed + travel) - there, axis=1).max()
+    assert 0.1 < off <= 1.05 * follows.facts["largest"]
 
 
 @pytest.mark.parametrize("to", ["marlin", "reprap", "smoothie"])
@@ -148,21 +253,11 @@ def test_repetier_needs_motor_steps():
     assert caught.value.found == "no steps_per_mm"
 
 
-def changed(text, old, new):
-    assert old in text
-    return text.replace(old, new)
-
-
 WRONG = {
     changed(SMOOTHIE, "M665 Z299.500", ""): {
         "where": "printer.txt",
         "expected": "the lines M665 that M503 prints, with L, R and Z, or arm_length, "
         "arm_radius and gamma_max",
-    },
-    changed(SMOOTHIE, "A0.0000", "A0.5"): {
-        "where": "printer.txt, line 4",
-        "found": "0.5",
-        "expected": "0",
     },
     changed(SMOOTHIE, "R105.0000", "Rnan"): {
         "where": "printer.txt, line 4",
@@ -178,14 +273,19 @@ WRONG = {
         "found": "'inf'",
         "expected": "a number in mm, or degrees",
     },
+    changed(REPETIER_HOST, '"105.000"', '"105,0"'): {
+        "where": "printer.txt, line 1",
+        "found": '\'<epr pos="885" type="3" value="105,0">\'',
+    },
+    changed(REPETIER, "913 0.000", "913 0.100")
+    .replace("210.200", "329.900")
+    .replace("933 0.100", "917 0.100 x\nEPR:3 933 0.100"): {
+        "where": "printer.txt",
+        "found": "329.9, 329.9, 90.3 degrees",
+    },
     changed(REPETIER, "EPR:3 153", "EPR:3 154"): {
         "where": "printer.txt",
         "expected": "a line EPR: with 153 and a number, as M205 prints it",
-    },
-    changed(REPETIER, "913 0.000", "913 0.100"): {
-        "where": "printer.txt, line 12",
-        "found": "0.1",
-        "expected": "0",
     },
     changed(REPETIER, "EPR:3 885 105.000", "EPR:3 885 1e9"): {
         "where": "printer.txt, line 4",
@@ -196,6 +296,18 @@ WRONG = {
         "where": "printer.txt, line 1",
         "found": "0",
         "expected": "above 0",
+    },
+    changed(REPETIER_HEADER, "SYSTEM 3", "SYSTEM 1"): {
+        "where": "printer.txt, line 1",
+        "found": "'DRIVE_SYSTEM 1'",
+    },
+    changed(REPETIER_HEADER, "#define ROD_RADIUS (P", "#define END_EFFECTOR_OFFSET (P"): {
+        "where": "printer.txt",
+        "expected": "#define END_EFFECTOR_HORIZONTAL_OFFSET with a number",
+    },
+    changed(REPETIER_HEADER, "PRINTER_RADIUS", "P").replace("ROD_RADIUS (", "ROD_RADUIS ("): {
+        "where": "printer.txt",
+        "found": "'ROD_RADUIS' in line 17",
     },
     f"EPR:3 {5000 * '8'} 1 x\n": {
         "where": "printer.txt",
@@ -226,13 +338,39 @@ def test_values_that_config_g_loads_count_where_their_file_is_beside_it(tmp_path
     assert read_printer(tmp_path / "config.g").radius == 100
 
 
-def test_points_of_smoothieware_are_the_nozzles_at_contact(tmp_path):
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("_trim_mm", "_trim"),  # until 2016
+        (
+            "gamma_max            300",
+            "endstop.minz.axis Z\nendstop.minz.homing_direction none\n"
+            "endstop.minz.homing_position 7\nendstop.maxz.axis Z\n"
+            "endstop.maxz.homing_direction home_to_max\nendstop.maxz.homing_position 300",
+        ),
+        ("gamma_max            300", "gamma_max 299\ngamma_max 300"),
+    ],
+)
+def test_older_and_newer_keys_of_smoothieware(old, new, tmp_path):
+    printer = read_printer(text_file(tmp_path, changed(CONFIG, old, new)))
+    np.testing.assert_allclose(printer.homed, read_printer(text_file(tmp_path, CONFIG)).homed)
+    assert not printer.remarks
+
+
+def test_the_third_tower_of_smoothieware_had_another_letter(tmp_path):
+    old = read_printer(text_file(tmp_path, changed(SMOOTHIE, " H0.3000", " F0.3000")))
+    np.testing.assert_allclose(old.angle, [210.2, 329.9, 90.3])
+
+
+def test_points_of_smoothieware_are_counted_from_the_third_carriage(tmp_path):
+    """G29.1 prints the carriage's height above the middle less the travel to contact."""
     printer = read_printer(text_file(tmp_path, CONFIG))
     a = np.deg2rad(60 * np.arange(6) + 30)
     want = np.column_stack([80 * np.cos(a), 80 * np.sin(a), 0.1 * np.arange(6)])
     want = np.vstack([want, [0, 0, -0.2]])
     text = "initial Bed ht is 295.000000 mm\ncenter probe: 0.0100\n"
-    text += "".join(f"< X{x:.4f} Y{y:.4f} Z{z:.4f}\n" for x, y, z in want)
+    start, carriage = 5.0, 5.0 + np.sqrt(printer.rod[2] ** 2 - printer.radius**2)
+    text += "".join(f"< X{x:.4f} Y{y:.4f} Z{carriage - (start - z):.4f}\n" for x, y, z in want)
     touches, _ = read_measured(text_file(tmp_path, text + "max delta: 0.7\n", "log.txt"), printer)
     ideal = Ideal(printer.radius, printer.angle, printer.rod, printer.homed)
     np.testing.assert_allclose(ideal.tool(touches.carriages), want, atol=1e-3)
@@ -311,7 +449,7 @@ def test_a_misspelt_name_of_a_needed_value_is_in_the_error(name, key, wrong, tmp
         ("klipper", "angle", "anlge"),
         ("klipper", "print_radius", "print_raduis"),
         ("marlin", "DELTA_ENDSTOP_ADJ", "DELTA_ENSTOP_ADJ"),
-        ("smoothie", "gamma_trim", "gama_trim"),
+        ("smoothie", "gamma_trim_mm", "gama_trim_mm"),
     ],
 )
 def test_a_misspelt_name_of_a_value_with_a_default_is_a_remark(name, key, wrong, tmp_path):
@@ -342,6 +480,16 @@ def test_expressions_of_reprapfirmware_are_refused_with_what_to_write(line, tmp_
     assert f"Send {line.split()[0]} " in caught.value.next_step
 
 
+@pytest.mark.parametrize(("kind", "step"), [("6", True), ("10", False), ("1", False)])
+def test_other_kinematics_of_reprapfirmware_are_named(kind, step, tmp_path):
+    text = f"M584 X0 Y1 Z2\nM669 K3 ; a comment K4\n  M669 N4 K{kind} A0:-1600:-130\n"
+    with pytest.raises(InputError) as caught:
+        read_printer(text_file(tmp_path, text, "config.g"))
+    assert caught.value.where == "config.g, line 3"
+    assert caught.value.found == f"'M669 K{kind}'"
+    assert (caught.value.next_step is not None) == step
+
+
 REPRAP = "M665 L270.5:270.5:270.5 R105.5 H300.5 B90 X0.2 Y-0.1 Z0.3\nM666 X-0.25 Y0 Z-1.5 A0 B0\n"
 
 
@@ -363,6 +511,36 @@ def test_a_damaged_value_is_no_default(name, text, line, tmp_path):
     with pytest.raises(InputError) as caught:
         read_printer(text_file(tmp_path, text, name))
     assert caught.value.where == (name if line is None else f"{name}, line {line}")
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"EPR:1 294 210 Extr.1 Preheat temp. [\xb0C]\r\n" + REPETIER.encode(),
+        REPETIER.encode("utf-16"),
+        codecs.BOM_UTF16_BE + REPETIER.replace("\n", "\r\n").encode("utf-16-be"),
+        codecs.BOM_UTF8 + REPETIER.encode(),
+    ],
+)
+def test_logs_in_the_encodings_of_hosts_and_shells(raw, tmp_path):
+    """A degree sign in Latin-1, as firmwares print it, and what Windows' shell saves."""
+    (tmp_path / "eeprom.txt").write_bytes(raw)
+    assert read_printer(tmp_path / "eeprom.txt").radius == 105.0
+
+
+@pytest.mark.parametrize("raw", [b"\x89PNG\r\n", bytes(range(256)), REPETIER.encode("utf-16-le")])
+def test_what_is_no_text_is_no_printer(raw, tmp_path):
+    (tmp_path / "eeprom.txt").write_bytes(raw)
+    with pytest.raises(InputError) as caught:
+        read_printer(tmp_path / "eeprom.txt")
+    assert caught.value.code == "file.not_text"
+
+
+def test_a_print_radius_beyond_the_rods_is_refused(tmp_path):
+    printer = read_printer(text_file(tmp_path, changed(REPETIER, "925 90.000", "925 9000")))
+    with pytest.raises(InputError) as caught:
+        nominal_text(printer)
+    assert caught.value.where == "printer.txt"
 
 
 def test_printers_in_metres_are_refused(tmp_path):

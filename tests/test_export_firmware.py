@@ -98,13 +98,14 @@ def test_an_ideal_linear_delta_is_recovered():
 @pytest.mark.parametrize("firmware", firmwares(), ids=lambda one: one.name)
 def test_a_firmware_reads_what_it_writes(firmware):
     entries = {"workspace_radius": 0.0905, "height_offset": 0.0, "steps_per_mm": 3 * (800.0,)}
-    machine = with_values(ideal_linear(), **entries)
+    rods = [0.2695, 0.27, 0.2712] if firmware.linear.rods else 3 * [0.27]
+    machine = with_values(ideal_linear(rods=rods), **entries)
     (text,) = firmware.files(source_of(machine)).values()
     assert [one for one in firmwares() if one.evidence(text, "x")] == [firmware]
     printer = firmware_of(text, "x").printer(text, Path("x"))
     assert printer.radius == pytest.approx(110, abs=1e-3)
     assert printer.reach == (None if firmware.name in ("marlin", "smoothie") else 90.5)
-    np.testing.assert_allclose(np.sort(printer.rod), [269.5, 270, 271.2], atol=1e-3)
+    np.testing.assert_allclose(np.sort(printer.rod), 1e3 * np.array(rods), atol=1e-3)
     # carriages at the bed's centre, from the rods' lengths and the towers' circle
     heights = printer.carriages(np.zeros((1, 3)))[0]
     np.testing.assert_allclose(heights, np.sqrt(printer.rod**2 - 110**2), atol=2e-3)

@@ -74,6 +74,14 @@ def test_written_and_read_again(tmp_path):
     np.testing.assert_allclose(again.values, first.values, atol=2e-6)
 
 
+def test_spools_without_build_up_are_not_written(tmp_path):
+    """The firmware divides by Q: its motors would stand still."""
+    machine = machine_of(CONFIG.replace("Q0.038", "Q0"), tmp_path)
+    with pytest.raises(InputError) as caught:
+        make_export(source_of(machine), "hangprinter")
+    assert caught.value.found == "a spool without build-up"
+
+
 def test_lines_without_spools_are_read_as_positions(tmp_path):
     machine = machine_of(CONFIG.partition("M666")[0], tmp_path)
     assert set(machine.joint_units) == {"m"}

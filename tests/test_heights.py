@@ -713,6 +713,27 @@ def test_what_no_reprapfirmware_printer_has_is_refused_with_its_line(letter, val
 
 
 MAP = "RepRapFirmware height map file v2\nxmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum\n"
+
+
+@pytest.mark.parametrize("override", [False, True])
+def test_the_tool_is_beside_the_probe_of_reprapfirmware(override, tmp_path):
+    """Places of a map and of G30 are those under the probe, by G31 at the nozzle plus X and Y."""
+    config = "M665 L270:270:270 R105 H300\nM666 X0 Y0 Z0\nG31 P500 X20 Y-5 Z2.5 ; X1\n"
+    (tmp_path / "config-override.g").write_text("G31 K0 P500 X-12.0\n" if override else "")
+    path = text_file(tmp_path, config + "M501\n", "config.g")
+    places = [(0, 0), (60, 0), (-60, 0), (0, 60), (0, -60), (40, 40), (-40, -40)]
+    log = "".join(f"G30 P{k} X{x} Y{y} Z-99999\n" for k, (x, y) in enumerate(places))
+    log += "G32 bed probe heights:" + 7 * " 0.100" + ", mean 0.1\n"
+    printer = read_printer(path)
+    tool = np.array([(x - (-12 if override else 20), y + 5, 0.1) for x, y in places])
+    touches, _ = read_measured(text_file(tmp_path, log), printer)
+    np.testing.assert_allclose(touches.carriages, printer.carriages(tool), atol=1e-9)
+    path.write_text(config.replace("X20", "X{global.dx}"))
+    with pytest.raises(InputError) as caught:
+        read_measured(text_file(tmp_path, log), read_printer(path))
+    assert caught.value.where == "config.g"
+
+
 WRONG_POINTS = {
     "ok\n": "there is no point of a bed in this file",
     "probe at 300.000,0.000 is z=0.1\n": "the printer does not reach this point",
@@ -720,7 +741,10 @@ WRONG_POINTS = {
     MAP + "-10,10\n0.1\n": "the height map does not define its grid",
     MAP + "-10,10,-10,10,-1,0,10,3,3\n0.1,0.2,0.2\n": "a number above zero under xspacing",
     MAP + "-10,10,nan,10,-1,10,10,3,3\n0.1,0.2,0.2\n": "a number under ymin",
-    MAP + "-10,10,-10,10,-1,10,10,3,3\n0.1,high,0.2\n": "a height is no number",
+    MAP + "-10,10,-10,10,-1,10,10,3,1\n0.1,high,0.2\n": "row 1 of heights: a height is no number",
+    MAP + "-10,10,-10,10,-1,10,10,3,1\n0.1,nan,0.2\n": "found 'nan', expected millimetres",
+    MAP + "-10,10,-10,10,-1,10,10,3,3\n0.1,0.1,0.2\n": "found 1 rows, expected 3 rows of 3",
+    MAP + "-10,10,-10,10,-1,10,10,3,1\n0.1,0.1\n": "row 1 of heights: the height map is not com",
     "G30 P0 X0 Y0 Z-99999\nG32 bed probe heights: 0.1 0.2, mean 0.1\n": "do not belong together",
 }
 

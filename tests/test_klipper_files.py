@@ -30,6 +30,13 @@ def files(folder, **texts):
     return paths[0]
 
 
+def test_a_probe_without_its_height_is_a_remark(tmp_path):
+    """Klipper requires z_offset, which may be in the saved block or in a file that is missing."""
+    for text, remarks in ((PROBE, 0), (PROBE.replace("z_offset", "#z_offset"), 1)):
+        printer = read_printer(files(tmp_path, printer_cfg=text + CFG))
+        assert len(printer.remarks) == remarks
+
+
 # ------------------------------------------------------------------ included files
 
 

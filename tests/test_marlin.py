@@ -214,6 +214,21 @@ def test_nominal_values_come_back(text, tmp_path):
     np.testing.assert_allclose(again.rod, 270 + np.array(trims), atol=2e-4)
 
 
+def test_missing_end_switch_offsets_are_a_remark(tmp_path):
+    text = "\n".join(line for line in M503.splitlines() if "M666" not in line)
+    assert [("M666" in one) for one in read_printer(text_file(tmp_path, text)).remarks] == [True]
+
+
+def test_the_height_at_home_had_another_name(tmp_path):
+    """Until 1.1.0; later configurations define it by DELTA_HEIGHT."""
+    text = CONFIGURATION.replace("DELTA_HEIGHT 284.00", "MANUAL_Z_HOME_POS 284.00")
+    old = read_printer(text_file(tmp_path, text))
+    both = text + "#define DELTA_HEIGHT 284.0\n#define MANUAL_Z_HOME_POS DELTA_HEIGHT\n"
+    both = both.replace("#define MANUAL_Z_HOME_POS 284.00\n", "")
+    for other in (CONFIGURATION, both):
+        np.testing.assert_array_equal(old.homed, read_printer(text_file(tmp_path, other)).homed)
+
+
 @pytest.mark.parametrize("text", [M503, OLDER])
 def test_h_keeps_the_convention_in_which_it_was_read(text, tmp_path):
     """Carriages that are half a millimetre higher at home put the nozzle as much higher."""
@@ -433,6 +448,7 @@ def without(text, word):
         grid_lines(np.zeros((3, 3)), "G29"),
         grid_lines(np.zeros((3, 3)), "G29 L-60 R60 F-60"),
         "Bed Topography Report:\n",
+        "Mesh Bed Leveling:\nNum X,Y: 3,3\nMeasured points:\n        0         1\n",
         "G33 Auto Calibrate\nChecking... AC\n.    c:+0.10  x:+0.02  y:-0.01  z:+0.00\n",
         without(G33, " at radius:80.00"),
         without(G33, " (DRY-RUN)"),
@@ -526,6 +542,10 @@ def test_a_firmware_is_named_for_a_printer():
 
 
 WRONG = {
+    "\n".join(line for line in M503.splitlines() if "M665" not in line): {
+        "where": "printer.txt",
+        "expected": "the line M665 that M503 prints, with L, R and H",
+    },
     OLDEST: {"where": "printer.txt, line 2", "found": "M665 without H, as Marlin 1.1.0 prints it"},
     changed(M503, "Y0.0000 Z-1.5", "Y0.5000 Z-1.5"): {
         "where": "printer.txt, line 6",

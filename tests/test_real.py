@@ -120,7 +120,8 @@ def test_printers_have_their_firmwares_numbers(name):
     case = CASES[name]
     printer = read_printer(REAL / name / case["file"])
     assert type(printer.firmware).__name__ == case["firmware"]
-    assert printer.radius == case["radius"]
+    # towers with radii of their own are on one circle, which no file states
+    assert printer.radius == pytest.approx(case["radius"], abs=1e-9)
     np.testing.assert_array_equal(printer.rod, case["rod"])
     np.testing.assert_allclose(printer.angle, case["angle"], atol=1e-9)
     np.testing.assert_allclose(printer.homed, case["homed"], atol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import json
 import math
@@ -53,6 +54,20 @@ def read_text(path: Path, label: str | None = None, largest: int = LARGEST_TEXT_
     largest : largest size in bytes.
     """
     return "".join(text_blocks(path, label or path.name, largest))
+
+
+def read_log(path: Path) -> str:
+    """Text that a program printed, as a host or a shell saved it, with Unix line ends.
+
+    UTF-8, or UTF-16 with its byte-order mark; bytes of other encodings, such as a degree sign in
+    Latin-1, are replaced.
+    """
+    raw = b"".join(_raw_blocks(path, path.name, LARGEST_TEXT_FILE, TEXT_BLOCK_BYTES))
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raw = raw.decode("utf-16", "replace").encode()
+    elif not raw.startswith(tuple(BINARY_KINDS)):
+        raw = raw.decode("utf-8", "replace").encode()
+    return _decoded(raw, path.name, 0).removeprefix("\ufeff")
 
 
 def text_blocks(

@@ -38,7 +38,7 @@ from pkmcal.exporters.delta_texts import (
     switch_values,
     workspace_radius,
 )
-from pkmcal.files import closest, quoted, read_text
+from pkmcal.files import closest, quoted, read_log
 from pkmcal.firmware.cables import check_millimetres
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.wording import listed
@@ -405,7 +405,7 @@ def read_printer(path: Path, firmware: str | None = None) -> Printer:
     printer that is not a linear delta.
     """
     label = path.name
-    text = read_text(path)
+    text = read_log(path)
     return buildable_delta(firmware_of(text, label, firmware).printer(text, path))
 
 

@@ -12,6 +12,7 @@ import operator
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, missing_value
 
+NO_CONSTANTS: Mapping[str, str] = MappingProxyType(dict[str, str]())
 LONGEST_EXPRESSION = 200
 """Bound on the characters of a value or a condition."""
 DEEPEST_DEFINITION = 10
@@ -81,12 +83,14 @@ def _code_lines(text: str) -> Iterator[tuple[int, str]]:
         yield n, "".join(code).strip()
 
 
-def active_definitions(text: str) -> Iterator[Define]:
+def active_definitions(text: str, constants: Mapping[str, str] = NO_CONSTANTS) -> Iterator[Define]:
     """Definitions that hold: not commented out, and in no branch of a condition that is false.
 
     A condition that cannot be evaluated may hold, and so may all branches after it.
+
+    constants : values by name of what another header defines.
     """
-    values: dict[str, str] = {}
+    values = dict(constants)
     # of each enclosing condition: whether this branch holds, and whether one before it did; None
     # where unknown
     branches: list[tuple[bool | None, bool | None]] = []
@@ -151,13 +155,19 @@ class Definitions:
     """Definitions of a header.
 
     by_name : all that may hold, in the order of the file. label : the file's name, for messages.
-    legal : the names that are read.
+    legal : the names that are read. constants : as for :func:`active_definitions`.
     """
 
-    def __init__(self, text: str, label: str, legal: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        text: str,
+        label: str,
+        legal: Collection[str] = (),
+        constants: Mapping[str, str] = NO_CONSTANTS,
+    ) -> None:
         self.label, self.legal = label, legal
         self.by_name: dict[str, list[Define]] = {}
-        for define in active_definitions(text):
+        for define in active_definitions(text, constants):
             self.by_name.setdefault(define.name, []).append(define)
         self._results: dict[str, float] = {}
 

@@ -180,7 +180,11 @@ def _spools(machine: Machine) -> dict[str, Array]:
     if any(abs(t - abs(x)) > 1e-9 * abs(x) for t, x in zip(teeth, gear.tolist(), strict=True)):
         raise _refused(machine, f"a gear of {gear[0]:g}", "a ratio of two numbers of teeth")
     least = buildup.min()
-    share = buildup / least if least > 0 else np.ones(len(buildup))
+    if least <= 0:
+        raise _refused(
+            machine, "a spool without build-up", "build-ups above 0, by which the firmware divides"
+        )
+    share = buildup / least
     if np.abs(share - np.rint(share)).max() > 1e-9 or np.abs(lines - np.rint(lines)).max() > 1e-9:
         raise _refused(
             machine, "parts of a line", "whole numbers of lines, and build-ups that are multiples"

@@ -63,6 +63,7 @@ NO_KLIPPER_PRINT_RADIUS = (
     "There is no print_radius: keep the printer's own. Klipper takes delta_radius where none"
     " stands; then write the former delta_radius there."
 )
+PROBE_SECTIONS = ("probe", "bltouch", "smart_effector")
 _HEADS = re.compile(r"^\[([^\]\n]+)\]", re.MULTILINE)
 
 
@@ -139,7 +140,7 @@ class Klipper(Firmware):
             touches=saved_touches(config, ends, mm_a_step),
             part=saved_distances(config, ends, mm_a_step),
             step=CARRIAGE_STEP if mm_a_step is None else float(mm_a_step.max()),
-            remarks=config.remarks(),
+            remarks=(*config.remarks(), *_probe_remarks(config)),
         )
 
     def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
@@ -284,7 +285,7 @@ def _check_kinematics(config: KlipperConfig) -> None:
         where=where or f"{config.label}, [printer]",
         found=quoted(text),
         expected="kinematics: delta",
-        next_step="pkmcal new DIR --from FILE makes a session of this machine with a camera"
+        next_step="Make a session of this machine with a camera: pkmcal new DIR --from FILE"
         if text in ("rotary_delta", "winch")
         else None,
     )
@@ -297,6 +298,15 @@ def _probe_offset(config: KlipperConfig) -> tuple[float, float, float]:
             x, y = (config.number(section, f"{c}_offset", 0.0) for c in "xy")
             return x, y, config.number(section, "z_offset")
     return 0.0, 0.0, 0.0
+
+
+def _probe_remarks(config: KlipperConfig) -> tuple[str, ...]:
+    """Sentence on each probe without z_offset, which Klipper requires."""
+    return tuple(
+        f"[{section}] has no z_offset: the probe is taken to be at the nozzle."
+        for section, entries in config.entries.items()
+        if section in PROBE_SECTIONS and "z_offset" not in entries
+    )
 
 
 # Writing

@@ -88,10 +88,12 @@ BED_PROBES = {
 }  # fmt: skip
 """Definitions of which a printer with a probe has one; NOZZLE_TO_PROBE_OFFSET stands without."""
 
+HOME_HEIGHTS = ("DELTA_HEIGHT", "MANUAL_Z_HOME_POS")
+"""Names of the height at home; the second one until 1.1.0, and equal to the first since."""
 PRINT_RADII = ("DELTA_PRINTABLE_RADIUS", "PRINTABLE_RADIUS")
 """Older and newer name of the print radius."""
 DEFINES = (
-    "DELTA_DIAGONAL_ROD", "DELTA_RADIUS", "DELTA_HEIGHT", "DELTA_ENDSTOP_ADJ",
+    "DELTA_DIAGONAL_ROD", "DELTA_RADIUS", *HOME_HEIGHTS, "DELTA_ENDSTOP_ADJ",
     "DELTA_TOWER_ANGLE_TRIM", "DELTA_DIAGONAL_ROD_TRIM_TOWER", "DELTA_RADIUS_TRIM_TOWER",
     "NOZZLE_TO_PROBE_OFFSET", "DEFAULT_AXIS_STEPS_PER_UNIT", *PRINT_RADII,
 )  # fmt: skip
@@ -99,7 +101,12 @@ DEFINES = (
 MARLIN_COMMANDS = ("M665", "M666", "M92", "M851", "M206")
 _DELTA_HEADING = re.compile(r"echo:[\s;]*Delta settings|Delta settings: L[<=]", re.IGNORECASE)
 _PROGRAM = re.compile(r"FIRMWARE_NAME:\s*Marlin|echo:\s*Marlin|For Marlin\.", re.IGNORECASE)
-_DELTA_DEFINE = re.compile(r"^[^\S\n]*#[^\S\n]*define[^\S\n]+(DELTA_\w+)", re.MULTILINE)
+_DELTA_DEFINE = re.compile(
+    r"^[^\S\n]*#[^\S\n]*define[^\S\n]+"
+    r"(DELTA_(?:RADIUS|HEIGHT|ENDSTOP_ADJ|SMOOTH_ROD_OFFSET|TOWER_ANGLE_TRIM))\b",
+    re.MULTILINE,
+)
+"""Definitions that Repetier-Firmware's Configuration.h has not."""
 _DELTA_CONDITION = re.compile(r"\s*#\s*if.*\bDELTA\b")
 
 
@@ -160,7 +167,10 @@ class Marlin(Firmware):
                 next_step="Send G21 before M503",
             )
         words = read_commands(text, label, MARLIN_COMMANDS)
-        by_command = any(name.startswith("665") for name in words)
+        # the output of M503 without M665 has other commands, and no definitions
+        by_command = any(name.startswith("665") for name in words) or (
+            bool(words) and not _DELTA_DEFINE.search(text)
+        )
         settings = _commanded(words, label) if by_command else _configured(text, label)
         return settings.printer(self, label)
 
@@ -283,6 +293,8 @@ def _commanded(words: Words, label: str) -> Settings:
             " it at H less the Z of M851; export --to marlin is right for both, another firmware"
             " needs that height measured.",
         )
+    if not {"666X", "666Y", "666Z"} & words.keys():
+        remarks += ("The file has no M666: end switches' offsets are taken for 0.",)
     return Settings(
         rod=value("665L") + np.array(trims),
         radius=value("665R"),
@@ -366,6 +378,7 @@ def _configured(text: str, label: str) -> Settings:
         if steps.min() <= 0:
             raise impossible(values.place(name), name, float(steps.min()), "above 0")
     radii = [name for name in PRINT_RADII if name in values.by_name]
+    home = next((name for name in HOME_HEIGHTS if name in values.by_name), HOME_HEIGHTS[0])
     own_steps = [math.nan] if steps is None else steps.tolist()
     rod_trims = values.numbers("DELTA_DIAGONAL_ROD_TRIM_TOWER", 3, *zeros)
     angle_trims = values.numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros)
@@ -374,7 +387,7 @@ def _configured(text: str, label: str) -> Settings:
         radius=positive("DELTA_RADIUS"),
         angle=np.array(TOWER_ANGLES) + angle_trims,
         offset=offset,
-        height=positive("DELTA_HEIGHT") - height_offset,
+        height=positive(home) - height_offset,
         height_offset=height_offset,
         probe=(float(probe[0]), float(probe[1]), float(probe[2])),
         reach=positive(radii[0]) if radii else None,

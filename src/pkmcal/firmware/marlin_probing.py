@@ -48,6 +48,7 @@ _REPEATED = re.compile(rf"\bStandard Deviation:\s*{NUMBER}")
 _PLACELESS = {
     GRID_HEADING: "a grid of heights without its places",
     "Bed Topography Report": "a map of heights without its places",
+    "Measured points:": "a mesh of heights without its places",
     "G33 Auto Calibrate": "the output of a G33 whose places or values in force it does not contain",
 }
 _G33_START = re.compile(rf"Checking\.\.\. AC(?: at radius:\s*{NUMBER})?")

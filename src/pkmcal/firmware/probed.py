@@ -12,7 +12,7 @@ from pathlib import Path
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.exporters.delta import MM_A_METRE
-from pkmcal.files import read_csv, read_text
+from pkmcal.files import read_csv, read_log
 from pkmcal.firmware.contract import PrintedPart, Printer, Touches, firmwares, touches_at
 
 FEWEST_BED_POINTS = 7
@@ -31,7 +31,7 @@ def read_measured(
     reach.
     """
     label = path.name
-    text = read_text(path)
+    text = read_log(path)
     if text.startswith("configuration,"):
         return touches_at(_table_points(path, label), 0.0, printer, label), None
     readers = [printer.firmware] if own else firmwares()

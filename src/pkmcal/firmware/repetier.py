@@ -2,22 +2,27 @@
 as M206 by ``export --to repetier``.
 
 Semantics: Repetier-Firmware's Printer.cpp (homeZAxis, updateDerivedParameter) and Eeprom.cpp. Lines
-are ``EPR:type position value name``. The towers stand at the angles Alpha A, B and C on one circle,
-plus a correction of the radius for each, which is 0 here; rods have a correction of the length
-each. With the nozzle in the middle at Z max length, after homing, a carriage is lower than its
-switch by its endstop offset, in motor steps: the switch triggers at ``Z max length + sqrt(rod^2 -
-radius^2) + offset / steps per mm``.
+are ``EPR:type position value name``, and ``<epr pos="position" type="type" value="value">`` in
+Repetier-Host's files .epr. The towers stand at the angles Alpha A, B and C on one circle, plus a
+correction of the radius for each, which is written as 0; rods have a correction of the length each.
+With the nozzle in the middle at Z max length, after homing, a carriage is lower than its switch by
+its endstop offset, in motor steps: the switch triggers at ``Z max length + sqrt(rod^2 - radius^2) +
+offset / steps per mm``.
 
 ``Z-probe:10.66 X:0.00 Y:0.00`` of G29, G30 and G33 (Printer.cpp, runZProbe) is how far the probe
 moved down, with corrections, from a height that is not printed and depends on the version: such
 lines have no heights.
 
 All motors have one number of steps per mm, and the firmware rounds towers and rods to whole steps.
+
+Configuration.h has the values with which an empty EEPROM begins; later ones are in the EEPROM
+alone.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, final
 
@@ -39,6 +44,7 @@ from pkmcal.firmware.contract import (
     printer_number,
     travel_without_start,
 )
+from pkmcal.firmware.definitions import Definitions
 from pkmcal.firmware.towers import (
     SettingNames,
     Settings,
@@ -50,6 +56,8 @@ from pkmcal.firmware.towers import (
     written_values,
 )
 
+DELTA = "3"
+"""DRIVE_SYSTEM of a delta, which Repetier.h defines."""
 INTEGER, FLOAT = 1, 3
 """Types of the EEPROM's values."""
 ROD, RADIUS, HEIGHT, REACH, STEPS = 881, 885, 153, 925, 11
@@ -57,8 +65,33 @@ SWITCHES, ANGLES = (893, 895, 897), (901, 905, 909)
 RADIUS_CORRECTIONS, ROD_CORRECTIONS = (913, 917, 921), (933, 937, 941)
 ZERO_POSITIONS = (133, 137, 141)
 """Positions of X, Y and Z min pos, which move the end switches as well."""
+NEEDED = (ROD, RADIUS, HEIGHT, STEPS, *SWITCHES, *ANGLES)
+"""Positions that every delta has."""
+HEADER = {
+    "DELTA_DIAGONAL_ROD": ROD,
+    "ROD_RADIUS": RADIUS,
+    "Z_MAX_LENGTH": HEIGHT,
+    "ZAXIS_STEPS_PER_MM": STEPS,
+    "DELTA_MAX_RADIUS": REACH,
+    **{
+        name.format(letter): position
+        for name, letters, positions in (
+            ("DELTA_ALPHA_{}", "ABC", ANGLES),
+            ("DELTA_{}_ENDSTOP_OFFSET_STEPS", "XYZ", SWITCHES),
+            ("DELTA_RADIUS_CORRECTION_{}", "ABC", RADIUS_CORRECTIONS),
+            ("DELTA_DIAGONAL_CORRECTION_{}", "ABC", ROD_CORRECTIONS),
+            ("{}_MIN_POS", "XYZ", ZERO_POSITIONS),
+        )
+        for letter, position in zip(letters, positions, strict=True)
+    },
+}
+"""Positions in the EEPROM by names of Configuration.h."""
+OLD_RADIUS = ("PRINTER_RADIUS", "END_EFFECTOR_HORIZONTAL_OFFSET", "CARRIAGE_HORIZONTAL_OFFSET")
+"""Names whose difference is ROD_RADIUS where that is not defined."""
+_HEADER = re.compile(r"^[^\S\n]*#[^\S\n]*define[^\S\n]+(DELTA_ALPHA_A|ROD_RADIUS)\b", re.MULTILINE)
 _EEPROM = re.compile(r"\bEPR:(\d+) (\d+) (\S+)(?: (.{0,60}))?")
 _TRAVEL = re.compile(r"\bZ-probe: ?-?\d{1,4}\.\d{1,6} X:[^\n]{0,60}")
+_HOST = re.compile(r'<epr pos="(\d+)" type="(\d+)" value="([^"<]*)">')
 _WRITTEN = re.compile(r"M206 T(\d) P(\d+) [SX](\S+)(?: ; (.*))?")
 
 
@@ -69,26 +102,35 @@ class Repetier(Firmware):
     name: ClassVar = "repetier"
     title: ClassVar = "Repetier-Firmware: commands to send"
     program: ClassVar = "Repetier-Firmware"
-    configuration: ClassVar = "the lines EPR: of M205 (Repetier-Firmware)"
+    configuration: ClassVar = "the lines EPR: of M205, .epr, or Configuration.h (Repetier-Firmware)"
     file: ClassVar = "pkmcal_repetier.gcode"
     carriage_source: ClassVar = "what M114\nprints, turned into motors by its values"
 
     def evidence(self, text: str, label: str) -> tuple[str, ...]:
-        """The rod's length in the EEPROM."""
+        """The rod's length in the EEPROM, or definitions of a header."""
         del label
+        if define := _HEADER.search(text):
+            return (f"line {text.count(chr(10), 0, define.start()) + 1} defines {define[1]}",)
         for n, line in enumerate(text.splitlines(), 1):
-            for pattern in (_EEPROM, _WRITTEN):
-                match = pattern.search(line)
-                if match and match.group(1, 2) == (str(FLOAT), str(ROD)):
-                    return (f"line {n} has the EEPROM's rod length, {ROD}",)
+            typed = [match.group(1, 2) for p in (_EEPROM, _WRITTEN) for match in p.finditer(line)]
+            typed += [match.group(2, 1) for match in _HOST.finditer(line)]
+            if (str(FLOAT), str(ROD)) in typed:
+                return (f"line {n} has the EEPROM's rod length, {ROD}",)
         return ()
 
     def printer(self, text: str, path: Path) -> Printer:
-        """Printer of the EEPROM's values; of repeated ones the last counts.
+        """Printer of the EEPROM's values, of which the last counts, or of Configuration.h.
 
         Raises InputError for missing, malformed or impossible values.
         """
-        return _settings(_eeprom(text, path.name), path.name).printer(self, path.name)
+        if not _HEADER.search(text):
+            return _settings(_eeprom(text, path.name), path.name).printer(self, path.name)
+        settings = _settings(_header(text, path.name), path.name)
+        remark = (
+            "Configuration.h has the values of an empty EEPROM: if the printer was calibrated,"
+            " name the output of M205, which prints those in force."
+        )
+        return replace(settings, remarks=(*settings.remarks, remark)).printer(self, path.name)
 
     def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
         """None without lines of probing. Raises InputError for these, which have no heights."""
@@ -194,6 +236,10 @@ def _eeprom(text: str, label: str) -> Words:
     for n, line in enumerate(text.splitlines(), 1):
         match = _EEPROM.search(line) or _WRITTEN.match(line.strip())
         where, what = f"{label}, line {n}", "a value of this line"
+        expected = "a number in mm, degrees or steps"
+        for one in _HOST.finditer(line):
+            value = printer_number(one[3], what, where, line=one[0], expected=expected)
+            out[one[1]] = value, where
         if match is None:
             if "EPR:" in line:
                 raise InputError(
@@ -203,16 +249,43 @@ def _eeprom(text: str, label: str) -> Words:
                     expected="EPR:, the type, the position and a number, as M205 prints them",
                 )
             continue
-        expected = "a number in mm, degrees or steps"
         value = printer_number(match[3], what, where, line=match[0], expected=expected)
         out[match[2]] = value, where
     return out
 
 
+def _header(text: str, label: str) -> Words:
+    """Value and place by position in the EEPROM, of Configuration.h.
+
+    Raises InputError for missing values, and for those that are no numbers in bounds.
+    """
+    values = Definitions(text, label, HEADER, {"DELTA": DELTA})
+    drives = values.by_name.get("DRIVE_SYSTEM", [])
+    if drives and drives[-1].value not in (DELTA, "DELTA"):
+        raise InputError(
+            "this configuration is not of a delta",
+            where=values.place("DRIVE_SYSTEM"),
+            found=quoted(f"DRIVE_SYSTEM {drives[-1].value}"),
+            expected=f"DRIVE_SYSTEM DELTA, or {DELTA}",
+        )
+    needed = {str(position) for position in NEEDED}
+    if "ROD_RADIUS" not in values.by_name and OLD_RADIUS[0] in values.by_name:
+        outer, *inner = (float(values.numbers(name, 1)[0]) for name in OLD_RADIUS)
+        radius = {str(RADIUS): (outer - sum(inner), values.place(OLD_RADIUS[0]))}
+        needed -= radius.keys()
+    else:
+        radius = Words()
+    return radius | {
+        str(position): (float(values.numbers(name, 1)[0]), values.place(name))
+        for name, position in HEADER.items()
+        if name in values.by_name or str(position) in needed
+    }
+
+
 def _settings(eeprom: Words, label: str) -> Settings:
     """Settings of the EEPROM. Raises InputError for missing or impossible values."""
     # M205 prints all of them, so a missing one is no 0
-    for position in (ROD, RADIUS, HEIGHT, STEPS, *SWITCHES, *ANGLES):
+    for position in NEEDED:
         if str(position) not in eeprom:
             raise InputError(
                 f"the EEPROM's value {position} is missing",
@@ -227,7 +300,7 @@ def _settings(eeprom: Words, label: str) -> Settings:
         value, place = eeprom.get(str(position), (1.0, ""))
         if value <= 0:
             raise impossible(place, f"the EEPROM's value {position}", value, "above 0")
-    for position in (*RADIUS_CORRECTIONS, *ZERO_POSITIONS):
+    for position in ZERO_POSITIONS:
         value, place = eeprom.get(str(position), (0.0, ""))
         if value:
             raise impossible(
@@ -239,6 +312,7 @@ def _settings(eeprom: Words, label: str) -> Settings:
     return Settings(
         rod=eeprom[str(ROD)][0] + values(ROD_CORRECTIONS),
         radius=eeprom[str(RADIUS)][0],
+        radius_trims=values(RADIUS_CORRECTIONS),
         angle=values(ANGLES),
         offset=-values(SWITCHES) / steps,
         height=eeprom[str(HEIGHT)][0],

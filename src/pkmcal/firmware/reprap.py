@@ -9,7 +9,9 @@ arm at the larger angle of A plus its adjustment. B is the print radius, beyond 
 accepts no position; if omitted it remains as it was, 80 mm by default.
 
 ``G29`` writes heightmap.csv, and a sequence of ``G30 Pn X Y Z-99999`` that ends with S-1 prints
-``G32 bed probe heights: ...``: tool heights at contact.
+``G32 bed probe heights: ...``: places under the probe, with the tool's height when its tip would
+touch the bed there. The tool is beside them by X and Y of ``G31`` (GCodes4.cpp, gridProbing;
+Move.cpp, GetProbeCoordinates).
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ from pkmcal.firmware.contract import (
     Printer,
     Touches,
     WrittenValues,
+    printer_number,
     touches_at,
 )
 from pkmcal.wording import listed
@@ -64,11 +67,16 @@ _OWN_COMMAND = re.compile(
 )
 """Commands, or their words, that Marlin has not: M666 A and B are the bed's tilt."""
 _M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
+_KINEMATICS = re.compile(r"^[^\S\n]*M669\b[^;\n]*?\sK(\d+)", re.MULTILINE)
+LINEAR_DELTA, HANGPRINTER = "3", "6"
+"""Numbers of kinematics behind M669 K; without M669, M665 makes the printer a linear delta."""
 _PRINT_RADIUS = re.compile(r"^[^\S\n]*M665\b[^;\n]*\sB", re.MULTILINE)
 _OURS = re.compile(r"\s*M(?:66[56]|501)\b")
 HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
 _G30 = re.compile(r"^[^\S\n]*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
 _G30_WORD = re.compile(rf"([PXY])\s*{NUMBER}", re.IGNORECASE)
+_G31 = re.compile(r"^[^\S\n]*G31\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
+_G31_WORD = re.compile(r"([XY])\s*(-?[0-9.]+|\{)", re.IGNORECASE)
 _HEIGHTS = re.compile(rf"bed probe heights:((?:\s+{NUMBER})+)", re.IGNORECASE)
 
 
@@ -86,8 +94,8 @@ class RepRap(Firmware):
     rotary: ClassVar = linear
 
     def evidence(self, text: str, label: str) -> tuple[str, ...]:
-        """The file's name, or commands and words that this firmware alone has beside M665."""
-        if not _M665.search(text):
+        """The file's name, or words of this firmware alone, beside M665 or M669."""
+        if not _M665.search(text) and not _KINEMATICS.search(text):
             return ()
         reasons = [f"it is called {label}"] if label.lower() in FILE_NAMES else []
         for n, line in enumerate(text.splitlines(), 1):
@@ -106,6 +114,17 @@ class RepRap(Firmware):
         Raises InputError for missing, malformed or impossible values.
         """
         label = path.name
+        for kind in list(_KINEMATICS.finditer(text))[-1:]:
+            if kind[1] != LINEAR_DELTA:
+                raise InputError(
+                    "heights of a bed are read of linear deltas",
+                    where=f"{label}, line {text.count(chr(10), 0, kind.start(1)) + 1}",
+                    found=quoted(f"M669 K{kind[1]}"),
+                    expected=f"M665, or M669 K{LINEAR_DELTA}",
+                    next_step="Make a session of a Hangprinter: pkmcal new DIR --from FILE"
+                    if kind[1] == HANGPRINTER
+                    else None,
+                )
         words, places, remarks = _checked_words(text, label, path.with_name(OVERRIDE))
         rod, radius, height = (
             _words(words, label, "665" + letter, size)
@@ -140,6 +159,7 @@ class RepRap(Firmware):
             homed=ends,
             reach=None if reach is None else float(reach[0]),
             carriages=partial(reprap_carriage_heights, command),
+            offset=_probe_offset(text, path.with_name(OVERRIDE)),
             step=CARRIAGE_STEP if steps is None else float(1 / steps.min()),
             steps=steps,
             remarks=remarks,
@@ -148,12 +168,23 @@ class RepRap(Firmware):
     def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
         """Points of a height map, or of lines G30 with the heights that they printed."""
         label = path.name
+        values = _HEIGHTS.findall(text)
         if text.startswith(HEIGHT_MAP_TITLE):
-            return touches_at(_height_map_points(text, label), 0.0, printer, label)
-        if values := _HEIGHTS.findall(text):
+            points = _height_map_points(text, label)
+        elif values:
             points = _sequence_points(text, label, values[-1][0])
-            return touches_at(points, 0.0, printer, label)
-        return None
+        else:
+            return None
+        if not np.isfinite(printer.offset[:2]).all():
+            raise InputError(
+                "where the probe is beside the nozzle is not known",
+                where=printer.label,
+                found="G31 with an expression in braces",
+                expected="G31 with X and Y in mm",
+                next_step="Write these numbers into a copy of that line; G31 without values prints"
+                " them",
+            )
+        return touches_at(points - [*printer.offset[:2], 0.0], 0.0, printer, label)
 
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header of comments."""
@@ -350,6 +381,23 @@ def _checked_words(
     return words, places, remarks
 
 
+def _probe_offset(text: str, override: Path) -> tuple[float, float, float]:
+    """Offset (x, y, 0) of the probe from the nozzle, mm, by the last G31 with each; zeros without.
+
+    NaN where an expression gives it. override : file that M501 loads, whose values count.
+    """
+    if any(line.split()[:1] == ["M501"] for line in text.splitlines()) and override.is_file():
+        text += "\n" + read_text(override)
+    out = {"X": 0.0, "Y": 0.0}
+    for words in _G31.findall(text):
+        for letter, number in _G31_WORD.findall(words):
+            try:
+                out[letter.upper()] = float(number)
+            except ValueError:
+                out[letter.upper()] = np.nan
+    return out["X"], out["Y"], 0.0
+
+
 def _steps_per_mm(text: str, label: str) -> Array | None:
     """Motor steps per mm (3,) of the last M92 with X, Y and Z; None without one.
 
@@ -429,21 +477,29 @@ def _height_map_points(text: str, label: str) -> Array:
     x0, y0 = number_under("xmin", "min0"), number_under("ymin", "min1")
     dx = number_under("xspacing", "spacing0", "spacing", above=0.0)
     dy = number_under("yspacing", "spacing1", "spacing", above=0.0)
+    rows = [line.split(",") for line in lines[2:]]
+    size = tuple(
+        next((numbers[name] for name in names if name in numbers), "")
+        for names in (("xnum", "num0"), ("ynum", "num1"))
+    )
+    wrong = next((k for k, row in enumerate(rows, 1) if size[0] not in ("", str(len(row)))), None)
+    if wrong is not None or size[1] not in ("", str(len(rows))):
+        raise InputError(
+            "the height map is not complete",
+            where=label if wrong is None else f"{label}, row {wrong} of heights",
+            found=f"{len(rows)} rows" if wrong is None else f"{len(rows[wrong - 1])} heights",
+            expected=f"{size[1]} rows of {size[0]} heights, as line 3 has them",
+            next_step="Copy the whole file from the printer, or probe with G29 again",
+        )
     # RepRapFirmware writes a plain 0 for a point that was not probed
     out: list[tuple[float, float, float]] = []
-    for row, line in enumerate(lines[2:]):
-        for column, word in enumerate(line.split(",")):
+    for k, row in enumerate(rows):
+        for column, word in enumerate(row):
             if word.strip() in ("0", ""):
                 continue
-            try:
-                out.append((x0 + column * dx, y0 + row * dy, float(word)))
-            except ValueError:
-                raise InputError(
-                    "a height is no number",
-                    where=f"{label}, row {row + 1} of heights",
-                    found=word.strip(),
-                    expected="millimetres",
-                ) from None
+            place = f"{label}, row {k + 1} of heights"
+            z = printer_number(word.strip(), "a height", place, expected="millimetres")
+            out.append((x0 + column * dx, y0 + k * dy, z))
     return np.array(out).reshape(-1, 3)
 
 

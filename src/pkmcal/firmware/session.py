@@ -331,7 +331,8 @@ def _default_sigma(kind: type[MeasurementKind]) -> str:
 def nominal_text(printer: Printer, reached: Array | None = None) -> str:
     """Nominal model of the printer as a mechanism file, without its key ``fixed``.
 
-    reached : (n, 3) mm, heights of the carriages that their ranges have to include.
+    reached : (n, 3) mm, heights of the carriages that their ranges have to include. Raises
+    InputError for a print radius out of reach.
     """
     angle = np.deg2rad(printer.angle)
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -342,6 +343,13 @@ def nominal_text(printer: Printer, reached: Array | None = None) -> str:
     with np.errstate(invalid="ignore"):
         carriages = [printer.carriages(s * edge) for s in (-1.0, 1.0)]
     carriages += [] if reached is None else [reached]
+    if not np.isfinite(np.concatenate(carriages)).any():
+        raise InputError(
+            "the rods do not reach the print radius",
+            where=printer.label,
+            found=f"a print radius of {reach:g} mm, rods of {printer.rod.min():g} mm",
+            expected="a print radius within the towers",
+        )
     lowest = float(np.nanmin(np.concatenate(carriages))) - CARRIAGE_MARGIN_BELOW
     # tool height at which the first carriage reaches its end switch, on the axis
     top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())

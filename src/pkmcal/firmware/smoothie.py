@@ -1,16 +1,23 @@
 """Smoothieware: M665, M666 and M92 of linear deltas, read from what M503 prints, config-override or
 the file config, and written by ``export --to smoothie``.
 
-Semantics: Smoothieware's LinearDeltaSolution.cpp, Endstops.cpp and Robot.cpp. The rods have the
-length L plus their trims I, J, K, the towers stand at 210 + D, 330 + E and 90 + H degrees on one
-circle of radius R, plus A, B and C, which are 0 here. Z of M665 and of M206 together are the
-nozzle's height at home. A carriage is at ``height + sqrt(rod^2 - R^2) - trim`` where its switch
-triggers; its trim is that of M666, negative downwards.
+Semantics: Smoothieware's LinearDeltaSolution.cpp, Endstops.cpp and Robot.cpp. All rods have the
+length L, the towers stand at 210 + D, 330 + E and 90 + H (until 2015 F) degrees on one circle of
+radius R, plus A, B and C, which are 0 here. Z of M665 and of M206 together are the nozzle's height
+at home. A carriage is at ``height + sqrt(L^2 - R^2) - trim`` where its switch triggers; its trim is
+that of M666, negative downwards.
 
-``G29.1`` of DeltaCalibrationStrategy.cpp prints the nozzle's positions at contact, seven places.
+Trims of single rods, I, J and K, are in builds of pull request 1511 alone, which never was merged:
+they are read where a printer has them, and written as 0, since every other build ignores them
+without a message.
+
+``G29.1`` of DeltaCalibrationStrategy.cpp prints seven places and, as Z, the height of the third
+tower's carriage above the middle of the bed less the probe's travel (``start_z - z``, of an
+actuator): the nozzle's height at contact and that carriage's height above a nozzle in the middle.
 
 The file config has the same as arm_length, arm1_trim, arm_radius, delta_tower1_offset,
-delta_tower1_angle, gamma_max, alpha_trim, beta_trim, gamma_trim and alpha_steps_per_mm.
+delta_tower1_angle, gamma_max or endstop.NAME.homing_position, alpha_trim_mm (until 2016
+alpha_trim), beta_trim_mm, gamma_trim_mm and alpha_steps_per_mm.
 """
 
 from __future__ import annotations
@@ -28,7 +35,7 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import ExportedValue, commented
-from pkmcal.exporters.delta import Fit
+from pkmcal.exporters.delta import Fit, Freedoms
 from pkmcal.exporters.delta_texts import (
     about,
     firmware_angle,
@@ -73,10 +80,8 @@ CONFIG_WORDS = {
     **{f"delta_tower{k}_angle": "665" + c for k, c in enumerate(ANGLE_LETTERS, 1)},
     **{f"arm{k}_trim": "665" + c for k, c in enumerate(ROD_LETTERS, 1)},
     **{
-        f"{name}_trim": "666" + c for name, c in zip(("alpha", "beta", "gamma"), "XYZ", strict=True)
-    },
-    **{
-        f"{name}_steps_per_mm": "92" + c
+        f"{name}_{key}": code + c
+        for key, code in (("trim_mm", "666"), ("trim", "666"), ("steps_per_mm", "92"))
         for name, c in zip(("alpha", "beta", "gamma"), "XYZ", strict=True)
     },
 }
@@ -101,6 +106,7 @@ class Smoothie(Firmware):
     configuration: ClassVar = "the output of M503, config-override or config (Smoothieware)"
     file: ClassVar = "pkmcal_smoothie.gcode"
     carriage_source: ClassVar = "what M114.3\nprints"
+    linear: ClassVar = Freedoms(TOWER_ANGLES, rods=False)
 
     def evidence(self, text: str, label: str) -> tuple[str, ...]:
         """Headings of M503, letters of its M665, and keys of config."""
@@ -132,7 +138,7 @@ class Smoothie(Firmware):
         return replace(settings, remarks=remarks).printer(self, label)
 
     def touched(self, text: str, path: Path, printer: Printer) -> Touches | None:
-        """Points of G29.1: the nozzle's positions at contact. Repeats at a place are averaged.
+        """Points of G29.1. Repeats at a place are averaged.
 
         Raises InputError for the points of G29, whose heights begin at an unknown one.
         """
@@ -140,11 +146,13 @@ class Smoothie(Firmware):
             return None
         points = np.array(_PROBED.findall(text), dtype=float)
         if len(points):
-            return touches_at(means_by_position(points), 0.0, printer, path.name)
+            tower = float(printer.carriages(np.zeros((1, 3)))[0, 2])
+            tool = means_by_position(points) - [0.0, 0.0, tower]
+            return touches_at(tool, 0.0, printer, path.name)
         raise travel_without_start(
             path.name,
             PROBING,
-            "lines such as 'X-86.6000 Y-50.0000 Z0.1234'",
+            "lines such as 'X-86.6000 Y-50.0000 Z248.1234'",
             "Probe with G29.1, which prints them",
         )
 
@@ -153,17 +161,16 @@ class Smoothie(Firmware):
         steps = self.steps(fit)
         values = fitted_settings(fit)
         rule = "M666 is that height less each, and M665 Z that height."
-        rod = float(np.round(values.rod.mean(), 4))
         angles = values.angle - np.array(TOWER_ANGLES)
         lines = about(source, fit, "XYZ", steps_correction(steps))
         lines += switch_lines(fit, values.height, rule)
         code = [
-            f"M665 L{firmware_length(rod)} R{firmware_length(values.radius)}"
+            f"M665 L{firmware_length(values.rod[0])} R{firmware_length(values.radius)}"
             f" Z{firmware_length(values.height)} ; L rods, R radius, Z height at home",
             f"M665 {lettered(RADIUS_LETTERS, np.zeros(3), firmware_length)}"
             f" {lettered(ANGLE_LETTERS, angles, firmware_angle)}"
-            f" {lettered(ROD_LETTERS, values.rod - rod, firmware_length)}"
-            " ; one radius, DEH towers' angles, IJK rods' trims",
+            f" {lettered(ROD_LETTERS, np.zeros(3), firmware_length)}"
+            " ; one radius, DEH towers' angles, one length of rods",
             f"M666 {lettered('XYZ', values.offset, firmware_length)} ; end switches' trims, mm",
             "M206 X0 Y0 Z0 ; Z of M665 is the whole height",
             *([] if steps is None else [f"M92 {lettered('XYZ', steps, firmware_length)}"]),
@@ -183,7 +190,7 @@ class Smoothie(Firmware):
             radius="M665 R",
             height="M665 Z",
             angles=("M665 D", "M665 E", "M665 H"),
-            trims=("M665 I", "M665 J", "M665 K"),
+            trims=(),
             switches=("M666 X", "M666 Y", "M666 Z"),
         )
         return named_settings(letters, fit, at)
@@ -211,6 +218,7 @@ def _settings(words: Words, label: str, names: Mapping[str, str] = EMPTY) -> Set
             expected="the lines M665 that M503 prints, with L, R and Z, or arm_length, arm_radius"
             " and gamma_max",
         )
+    words = {"665H": words.get("665F", (0.0, "")), **words}
 
     def values(code: str, letters: str) -> Array:
         return np.array([words.get(code + c, (0.0, ""))[0] for c in letters])
@@ -218,15 +226,16 @@ def _settings(words: Words, label: str, names: Mapping[str, str] = EMPTY) -> Set
     for name in ("665L", "665R", "665Z", "92X", "92Y", "92Z"):
         if name in words and words[name][0] <= 0:
             raise impossible(words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "above 0")
-    for name in (*("665" + c for c in RADIUS_LETTERS), "206X", "206Y"):
+    for name in ("206X", "206Y"):
         if words.get(name, (0.0, ""))[0]:
             raise impossible(
                 words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "0",
-                "Set it to 0, home, and probe again: towers' angles and rods take its place",
+                "Set it to 0, home, and probe again",
             )  # fmt: skip
     return Settings(
         rod=words["665L"][0] + values("665", ROD_LETTERS),
         radius=words["665R"][0],
+        radius_trims=values("665", RADIUS_LETTERS),
         angle=np.array(TOWER_ANGLES) + values("665", ANGLE_LETTERS),
         offset=values("666", "XYZ"),
         height=words["665Z"][0] + words.get("206Z", (0.0, ""))[0],
@@ -244,11 +253,24 @@ def _config(text: str) -> Iterator[tuple[int, str, str]]:
 
 
 def _config_words(text: str, label: str) -> Words:
-    """Words of a file config. Raises InputError for values that are no numbers within bounds."""
+    """Words of a file config; of repeated keys the last counts.
+
+    Raises InputError for values that are no numbers within bounds.
+    """
+    # the switch at the upper end of Z, endstop.maxz in Smoothieware's examples, has any name
+    lines = list(_config(text))
+    entries = {key: value for _, key, value in lines}
+    heights = {
+        f"{switch}.homing_position"
+        for switch, _, name in (key.rpartition(".") for key in entries)
+        if name == "axis"
+        and entries[f"{switch}.axis"].upper().startswith("Z")
+        and entries.get(f"{switch}.homing_direction") == "home_to_max"
+    }
+    keys = {**dict.fromkeys(heights, CONFIG_WORDS["gamma_max"]), **CONFIG_WORDS}
     out: Words = {}
-    for n, key, value in _config(text):
-        if key not in CONFIG_WORDS:
-            continue
-        where = f"{label}, line {n}"
-        out[CONFIG_WORDS[key]] = printer_number(value, key, where), where
+    for n, key, value in lines:
+        if key in keys:
+            where = f"{label}, line {n}"
+            out[keys[key]] = printer_number(value, key, where), where
     return out

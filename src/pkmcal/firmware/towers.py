@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -52,6 +52,7 @@ class Settings:
 
     rod, angle, offset : (3,) lengths of the rods, directions of the towers, offsets of the end
         switches.
+    radius_trims : (3,) what is added to the radius for each tower.
     height : of the nozzle at home.
     height_offset : what the firmware's own height at home contains beyond `height`, if it is kept.
     probe : (x, y, z) from the nozzle; NaN where unknown.
@@ -65,6 +66,7 @@ class Settings:
     angle: Array
     offset: Array
     height: float
+    radius_trims: Array = field(default_factory=lambda: np.zeros(3))
     height_offset: float | None = None
     probe: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     reach: float | None = None
@@ -74,14 +76,35 @@ class Settings:
     __repr__ = short_repr
 
     def printer(self, firmware: Firmware, label: str) -> Printer:
-        """The printer of these values; label : name of its file."""
+        """The printer of these values; label : name of its file.
+
+        Towers on circles of their own stand on one circle about another middle. Raises InputError
+        for towers on a line.
+        """
         with np.errstate(invalid="ignore"):
             homed = switch_heights(self)
+        radius, angle = self.radius, self.angle
+        if self.radius_trims.any():
+            towers = tower_places(self)
+            chords = towers[1:] - towers[0]
+            if np.linalg.matrix_rank(chords) < 2:
+                raise InputError(
+                    "the towers stand on one line",
+                    where=label,
+                    found=", ".join(f"{a:g}" for a in self.angle) + " degrees",
+                    expected="three directions about 120 degrees apart",
+                )
+            middle = np.linalg.solve(2 * chords, np.sum(chords**2, axis=1))
+            radius = float(np.linalg.norm(middle))
+            x, y = (towers - towers[0] - middle).T
+            # as far round as the firmware's own directions
+            near = np.arctan2(y, x) * DEGREES_A_RADIAN
+            angle = near + 360 * np.round((self.angle - near) / 360)
         return Printer(
             firmware=firmware,
             label=label,
-            radius=self.radius,
-            angle=self.angle,
+            radius=radius,
+            angle=angle,
             rod=self.rod,
             homed=homed,
             reach=self.reach,
@@ -96,15 +119,20 @@ class Settings:
 
 def switch_heights(settings: Settings) -> Array:
     """Carriage heights (3,) mm at which the end switches trigger."""
-    rise = np.sqrt(settings.rod**2 - settings.radius**2)
+    rise = np.sqrt(settings.rod**2 - (settings.radius + settings.radius_trims) ** 2)
     return settings.height + rise - settings.offset
+
+
+def tower_places(settings: Settings) -> Array:
+    """Places (3, 2) mm of the towers."""
+    angle = settings.angle / DEGREES_A_RADIAN
+    radius = settings.radius + settings.radius_trims
+    return radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def tower_carriage_heights(settings: Settings, points: Array) -> Array:
     """Carriage heights (n, 3) mm at points (n, 3) mm."""
-    angle = settings.angle / DEGREES_A_RADIAN
-    towers = settings.radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    off = points[:, None, :2] - towers
+    off = points[:, None, :2] - tower_places(settings)
     return points[:, 2:] + np.sqrt(settings.rod**2 - np.sum(off**2, axis=-1))
 
 
@@ -190,13 +218,16 @@ def fitted_settings(fit: Fit, least_offset: float = 0.0) -> Settings:
 
 @dataclass(frozen=True)
 class SettingNames:
-    """A firmware's names of its settings; of each tower angle, rod's trim and switch."""
+    """A firmware's names of its settings; of each tower angle, rod's trim and switch.
+
+    trims : none for a firmware with one length for all rods.
+    """
 
     rod: str
     radius: str
     height: str
     angles: tuple[str, str, str]
-    trims: tuple[str, str, str]
+    trims: tuple[str, ...]
     switches: tuple[str, str, str]
 
 
@@ -218,7 +249,7 @@ def named_settings(
         (names.radius, fit.radius, "mm"),
         (names.height, height + height_offset, "mm"),
         *zip(names.angles, fit.angle - np.array(TOWER_ANGLES), 3 * ["degrees"], strict=True),
-        *zip(names.trims, fit.rod - rod, 3 * ["mm"], strict=True),
+        *((name, trim, "mm") for name, trim in zip(names.trims, fit.rod - rod, strict=False)),
         *zip(names.switches, height - heights, 3 * ["mm"], strict=True),
     )
     return tuple(ExportedValue(name, float(value), unit) for name, value, unit in numbers)
