@@ -27,9 +27,10 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import PriorScene
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.bundle import Fit, fit_state, marginalize_to_machine
+from pkmcal.identify.bundle import Fit, fit_state, fit_states, marginalize_to_machine
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, of_stations
+from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.image_batches import StationImages
@@ -136,26 +137,64 @@ def _silhouettes(
     return poses, {k: edges for k, (_, edges) in zip(stations, measured, strict=True)}
 
 
-def evaluate_pose(
-    session: Session, scene: PriorScene, station: int, T_camera_base: Array, view: StationView
-) -> tuple[PriorScene, float]:
-    """Scene estimated with one image at a camera pose (4, 4), and the cost of the machine's change.
+class EvaluatedPose(NamedTuple):
+    """Estimate with one image at a camera pose.
 
-    The cost is half the sum of squares by which the parameters and the joint readings are moved.
+    T_camera_base : (4, 4). T_base_platform : (K, 4, 4), estimated for the image's configuration.
+    edges : silhouettes of the image.
+    paid : cost of the machine's change, half the sum of squares by which the parameters and the
+        joint readings are moved.
+    """
+
+    machine: Machine
+    T_camera_base: Array
+    T_base_platform: Array
+    edges: EdgeSet
+    paid: float
+
+    @classmethod
+    def of(cls, fit: Fit, edges: EdgeSet) -> EvaluatedPose:
+        """Result of a fit to the edges of one image."""
+        state = fit.state
+        return cls(fit.machine, state.T_camera_base[0], state.T_base_platform, edges, fit.change)
+
+    def view_in(self, view: StationView) -> StationView:
+        """View of the image with this machine."""
+        return replace(view, machine=self.machine, all_poses=self.T_base_platform)
+
+
+def evaluate_poses(
+    session: Session, scene: PriorScene, station: int, T_camera_base: Array, view: StationView
+) -> list[EvaluatedPose | PkmcalError]:
+    """The scene estimated with one image at each of several camera poses (n, 4, 4), as runs of one
+    batch; the error of each that has none, because too few legs are measured.
+
     Images with accepted poses enter by their marginal prior, so the effort does not depend on their
-    number. Boards are left out: the score is about the legs. Raises a `PkmcalError` if too few legs
-    are measured.
+    number. Boards are left out: the score is about the legs.
 
     view : of this image.
     """
-    paid = 0.0
+    only = replace(session.of_stations([station]), trackers=(), links=())
+    results: list[EvaluatedPose | PkmcalError] = [
+        EvaluatedPose(scene.machine, T, scene.T_base_platform, EdgeSet.empty(), 0.0)
+        for T in T_camera_base
+    ]
     for _ in range(_OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal):
-        view = replace(view, machine=scene.machine, all_poses=scene.T_base_platform)
-        edges = silhouette_edges(view, T_camera_base, station).edges.scaled(scene.scatter)
-        near = {station: T_camera_base}
-        scene, fit = _joint_fit(session, scene, near, {station: edges}, Boards())
-        T_camera_base, paid = scene.T_camera_base[station], fit.change
-    return scene, paid
+        runs = [k for k, one in enumerate(results) if isinstance(one, EvaluatedPose)]
+        before = [one for one in results if isinstance(one, EvaluatedPose)]
+        edges = [
+            silhouette_edges(one.view_in(view), one.T_camera_base, 0).edges.scaled(scene.scatter)
+            for one in before
+        ]
+        measurements = [measurements_of(only, Boards(), own) for own in edges]
+        starts = [
+            start_state(one.machine, measured, one.T_camera_base[None])
+            for one, measured in zip(before, measurements, strict=True)
+        ]
+        fits = fit_states(session.machine, measurements, starts, scene.prior)
+        for k, own, fit in zip(runs, edges, fits, strict=True):
+            results[k] = fit if isinstance(fit, PkmcalError) else EvaluatedPose.of(fit, own)
+    return results
 
 
 def _joint_fit(
@@ -226,7 +265,7 @@ def rescore_poses(
     tables : finest distance tables of the image, computed if None.
     """
     p = image.decoded()
-    one = np.zeros(1, dtype=int)
+    first, scatter = np.zeros(1, dtype=int), _OPTIONS.silhouette_scatter
     view = finest_view(before.machine, p, session.joints, before.T_base_platform, tables)
     # candidates, refined with the machine as it is known
     near = (
@@ -235,22 +274,20 @@ def rescore_poses(
     )
     places = np.concatenate([hypotheses.T_camera_base[near][: _OPTIONS.candidates], others])
     # maximum likelihood with the machine unchanged; a changed machine is tried below
-    settled, log_likelihood_ratio = refine_ml(view, places, one, 16, 6, _OPTIONS.silhouette_scatter)
+    settled, log_likelihood_ratio = refine_ml(view, places, first, 16, 6, scatter)
     if before.edges:  # the machine changes little: search around the likeliest poses
         # equal poses have the same likelier one near them
         order = np.argsort(-log_likelihood_ratio, kind="stable")
-        order = order[distinct_silhouettes(view, settled[order], one)]
+        order = order[distinct_silhouettes(view, settled[order], first)]
         for k in order[: _OPTIONS.refined_locally]:
-            settled[k], log_likelihood_ratio[k] = refine_local(
-                view, settled[k], _OPTIONS.silhouette_scatter
-            )
+            settled[k], log_likelihood_ratio[k] = refine_local(view, settled[k], scatter)
         places = settled
     # drop poses that were scored before
     previous = ScoredPoses.nothing() if scores is None else scores
     order = np.argsort(-log_likelihood_ratio, kind="stable")
     both = np.concatenate([previous.T_camera_base, settled[order]])
     count = len(previous.T_camera_base)
-    order = order[[k - count for k in distinct_silhouettes(view, both, one) if k >= count]]
+    order = order[[k - count for k in distinct_silhouettes(view, both, first) if k >= count]]
     at, fits = (
         [*previous.T_camera_base, *settled[order]],
         [*previous.scores, *log_likelihood_ratio[order]],
@@ -258,20 +295,17 @@ def rescore_poses(
     paid = [*previous.paid, *np.zeros(len(order))]
     failures = [*previous.failures]
     # estimate the machine with the camera at each remaining pose
-    for number, T in enumerate(places[order], start=count):
-        best = max(fit / hypotheses.unit - cost for fit, cost in zip(fits, paid, strict=True))
-        if before.edges and fits[number] / hypotheses.unit < best - _OPTIONS.most_behind_best:
-            break  # the prior does not allow a change that large
-        try:
-            scene, cost = evaluate_pose(session, before, p.station, T, view)
-        except PkmcalError as error:  # such as too few legs measured
-            failures.append(str(error))
+    tried = places[order]
+    if before.edges:  # the prior allows no large change
+        worth = np.array(fits) / hypotheses.unit - paid
+        tried = tried[worth[count:] >= worth.max() - _OPTIONS.most_behind_best]
+    for one in evaluate_poses(session, before, p.station, tried, view):
+        if isinstance(one, PkmcalError):  # such as too few legs measured
+            failures.append(str(one))
             continue
-        changed = replace(view, machine=scene.machine, all_poses=scene.T_base_platform)
-        there, fit = refine_ml(
-            changed, scene.T_camera_base[[p.station]], one, 16, 6, _OPTIONS.silhouette_scatter
-        )
-        at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
+        T, changed = one.T_camera_base[None], one.view_in(view)
+        there, fit = refine_ml(changed, T, first, 16, 6, scatter)
+        at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, one.paid]
     previous = ScoredPoses(np.stack(at), np.array(fits), np.array(paid), tuple(failures))
     return _weighed(view, previous, hypotheses.unit), previous
 
