@@ -506,6 +506,13 @@ def test_images_that_are_held_out_are_not_misplaced(tmp_path):
     assert calibration.estimate.configurations.sum() == 3
 
 
+def test_too_few_configurations_to_hold_out_are_refused_before_images_are_read(searched):
+    steps = []
+    with raises(InputError, what="there are too few configurations to hold any out"):
+        calibrate_session(searched[0], holdout=2, progress=lambda step, _: steps.append(step))
+    assert "Reading images" not in steps
+
+
 def test_focal_lengths_are_found_within_their_deviations(breathed):
     calibration, truth = breathed
     stations = calibration_document(calibration)["stations"]
