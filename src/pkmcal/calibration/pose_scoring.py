@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import THREADS, Array
+from pkmcal.arrays import THREADS, Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import PriorScene
@@ -127,7 +127,7 @@ def _silhouettes(
         view = finest_view(scene.machine, images[k], session.joints, scene.T_base_platform)
         T = places[k]
         if k in refined:
-            T = refine_local(view, T, _OPTIONS.silhouette_scatter)[0]
+            T = refine_local(view, T[None], _OPTIONS.silhouette_scatter)[0][0]
         return T, silhouette_edges(view, T, k).edges.scaled(scene.scatter)
 
     stations = sorted(places)
@@ -275,19 +275,20 @@ def rescore_poses(
     places = np.concatenate([hypotheses.T_camera_base[near][: _OPTIONS.candidates], others])
     # maximum likelihood with the machine unchanged; a changed machine is tried below
     settled, log_likelihood_ratio = refine_ml(view, places, first, 16, 6, scatter)
-    if before.edges:  # the machine changes little: search around the likeliest poses
-        # equal poses have the same likelier one near them
-        order = np.argsort(-log_likelihood_ratio, kind="stable")
-        order = order[distinct_silhouettes(view, settled[order], first)]
-        for k in order[: _OPTIONS.refined_locally]:
-            settled[k], log_likelihood_ratio[k] = refine_local(view, settled[k], scatter)
-        places = settled
-    # drop poses that were scored before
     previous = ScoredPoses.nothing() if scores is None else scores
-    order = np.argsort(-log_likelihood_ratio, kind="stable")
-    both = np.concatenate([previous.T_camera_base, settled[order]])
     count = len(previous.T_camera_base)
-    order = order[[k - count for k in distinct_silhouettes(view, both, first) if k >= count]]
+
+    def unscored() -> Integers:
+        """Rows of the distinct poses that were not scored before, the likeliest first."""
+        order = np.argsort(-log_likelihood_ratio, kind="stable")
+        both = np.concatenate([previous.T_camera_base, settled[order]])
+        return order[[k - count for k in distinct_silhouettes(view, both, first) if k >= count]]
+
+    if before.edges:  # the machine changes little: search around the likeliest poses
+        best = unscored()[: _OPTIONS.refined_locally]
+        settled[best], log_likelihood_ratio[best] = refine_local(view, settled[best], scatter)
+        places = settled
+    order = unscored()
     at, fits = (
         [*previous.T_camera_base, *settled[order]],
         [*previous.scores, *log_likelihood_ratio[order]],
