@@ -50,6 +50,7 @@ from pkmcal.observe.pose_likelihood import (
 )
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.session.load import Session
 
 
@@ -85,6 +86,7 @@ def register_images(
     scene: PriorScene,
     places: Mapping[int, Array],
     boards: Boards,
+    progress: Progress = no_progress,
 ) -> PriorScene:
     """Scene estimated with further images at poses ``places``, T_camera_base (4, 4) by station.
 
@@ -95,19 +97,20 @@ def register_images(
     boards : boards in these images.
     """
     n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
-    every = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
-    again = len(every) >= _OPTIONS.refined_again_growth * len(scene.edges)
-    near, edges = _silhouettes(session, images, scene, every, (every if again else places).keys())
-    updated_scene = scene._replace(prior=None)
-    while True:
-        last, fit = _joint_fit(session, updated_scene, near, edges, boards)
+    near = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
+    again = len(near) >= _OPTIONS.refined_again_growth * len(scene.edges)
+    refined = (near if again else places).keys()
+    scene = scene._replace(prior=None)
+    for number in range(n_passes):
+        measured = part(progress, number / n_passes, (number + 1) / n_passes)
+        near, edges = _silhouettes(session, images, scene, near, refined, measured)
+        last, fit = _joint_fit(session, scene, near, edges, boards)
         # scatter of the silhouettes from their residuals, relative to the stated sigmas
-        updated_scene = last._replace(scatter=updated_scene.scatter * fit.edge_scale)
-        n_passes -= 1
-        if not n_passes:
-            return updated_scene._replace(prior=marginalize_to_machine(fit.info))
-        near = {k: updated_scene.T_camera_base[k] for k in near}
-        near, edges = _silhouettes(session, images, updated_scene, near, ())
+        scene = last._replace(scatter=scene.scatter * fit.edge_scale)
+        if number + 1 == n_passes:
+            scene = scene._replace(prior=marginalize_to_machine(fit.info))
+        near, refined = {k: scene.T_camera_base[k] for k in near}, ()
+    return scene
 
 
 def _silhouettes(
@@ -116,10 +119,12 @@ def _silhouettes(
     scene: PriorScene,
     places: Mapping[int, Array],
     refined: Collection[int],
+    progress: Progress,
 ) -> tuple[dict[int, Array], dict[int, EdgeSet]]:
     """Poses T_camera_base (4, 4) and silhouettes of images, by station, several images at a time.
 
     places : poses by station. refined : stations of which the likeliest pose near it is taken.
+    progress : called after each image.
     """
 
     def measure(k: int) -> tuple[Array, EdgeSet]:
@@ -130,11 +135,13 @@ def _silhouettes(
             T = refine_local(view, T[None], _OPTIONS.silhouette_scatter)[0][0]
         return T, silhouette_edges(view, T, k).edges.scaled(scene.scatter)
 
-    stations = sorted(places)
+    poses, edges, stations = dict[int, Array](), dict[int, EdgeSet](), sorted(places)
+    text = f"Estimating {len(stations)} localized images together"
     with ThreadPoolExecutor(THREADS) as pool:
-        measured = list(pool.map(measure, stations))
-    poses = {k: T for k, (T, _) in zip(stations, measured, strict=True)}
-    return poses, {k: edges for k, (_, edges) in zip(stations, measured, strict=True)}
+        for k, one in zip(stations, pool.map(measure, stations), strict=True):
+            poses[k], edges[k] = one
+            progress(text, len(poses) / len(stations))
+    return poses, edges
 
 
 class EvaluatedPose(NamedTuple):
