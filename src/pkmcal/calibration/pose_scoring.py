@@ -29,6 +29,7 @@ from pkmcal.calibration.case import PriorScene
 from pkmcal.errors import PkmcalError
 from pkmcal.identify.bundle import Fit, fit_state, fit_states, marginalize_to_machine
 from pkmcal.identify.start import start_state
+from pkmcal.identify.state import State
 from pkmcal.measurements import EdgeSet, of_stations
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
@@ -147,27 +148,25 @@ def _silhouettes(
 class EvaluatedPose(NamedTuple):
     """Estimate with one image at a camera pose.
 
-    T_camera_base : (4, 4). T_base_platform : (K, 4, 4), estimated for the image's configuration.
+    state : of this image alone; poses of other configurations are those of the start.
     edges : silhouettes of the image.
     paid : cost of the machine's change, half the sum of squares by which the parameters and the
         joint readings are moved.
     """
 
     machine: Machine
-    T_camera_base: Array
-    T_base_platform: Array
+    state: State
     edges: EdgeSet
     paid: float
 
-    @classmethod
-    def of(cls, fit: Fit, edges: EdgeSet) -> EvaluatedPose:
-        """Result of a fit to the edges of one image."""
-        state = fit.state
-        return cls(fit.machine, state.T_camera_base[0], state.T_base_platform, edges, fit.change)
+    @property
+    def T_camera_base(self) -> Array:
+        """Pose (4, 4) of the camera."""
+        return self.state.T_camera_base[0]
 
     def view_in(self, view: StationView) -> StationView:
         """View of the image with this machine."""
-        return replace(view, machine=self.machine, all_poses=self.T_base_platform)
+        return replace(view, machine=self.machine, all_poses=self.state.T_base_platform)
 
 
 def evaluate_poses(
@@ -182,25 +181,24 @@ def evaluate_poses(
     view : of this image.
     """
     only = replace(session.of_stations([station]), trackers=(), links=())
+    nothing = measurements_of(only, Boards())
+    begin = start_state(scene.machine, nothing, T_camera_base[:1])
     results: list[EvaluatedPose | PkmcalError] = [
-        EvaluatedPose(scene.machine, T, scene.T_base_platform, EdgeSet.empty(), 0.0)
+        EvaluatedPose(scene.machine, replace(begin, T_camera_base=T[None]), EdgeSet.empty(), 0.0)
         for T in T_camera_base
     ]
     for _ in range(_OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal):
-        runs = [k for k, one in enumerate(results) if isinstance(one, EvaluatedPose)]
-        before = [one for one in results if isinstance(one, EvaluatedPose)]
+        before = {k: one for k, one in enumerate(results) if isinstance(one, EvaluatedPose)}
         edges = [
             silhouette_edges(one.view_in(view), one.T_camera_base, 0).edges.scaled(scene.scatter)
-            for one in before
+            for one in before.values()
         ]
-        measurements = [measurements_of(only, Boards(), own) for own in edges]
-        starts = [
-            start_state(one.machine, measured, one.T_camera_base[None])
-            for one, measured in zip(before, measurements, strict=True)
-        ]
+        measurements = [replace(nothing, edges=own) for own in edges]
+        starts = [one.state for one in before.values()]
         fits = fit_states(session.machine, measurements, starts, scene.prior)
-        for k, own, fit in zip(runs, edges, fits, strict=True):
-            results[k] = fit if isinstance(fit, PkmcalError) else EvaluatedPose.of(fit, own)
+        for k, own, fit in zip(before, edges, fits, strict=True):
+            failed = isinstance(fit, PkmcalError)
+            results[k] = fit if failed else EvaluatedPose(fit.machine, fit.state, own, fit.change)
     return results
 
 
