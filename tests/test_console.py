@@ -114,6 +114,14 @@ def test_the_remaining_time_is_that_of_the_work():
     assert estimate.text(1.0, 20) == "0:00 left"
 
 
+def test_what_was_cached_promises_nothing():
+    """Six tenths come from the cache; a step that lasts longer than expected leaves more time."""
+    estimate = console.RemainingTime()
+    assert [estimate.text(*at) for at in ((0, 0), (0, 1), (0.6, 1.5))] == [""] * 3
+    assert estimate.text(0.7, 11) == "0:30 left"
+    assert estimate.text(0.7, 21) == "1:00 left"
+
+
 def drawn(text):
     """Text of a terminal without its control sequences, one frame of the bar a line."""
     return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text).replace("\r", "\n")

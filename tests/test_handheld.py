@@ -33,7 +33,8 @@ from pkmcal.calibration.localization_cache import (
     session_name,
 )
 from pkmcal.calibration.pose_scoring import (
-    evaluate_pose,
+    EvaluatedPose,
+    evaluate_poses,
     register_images,
     rescore_poses,
 )
@@ -505,6 +506,13 @@ def test_images_that_are_held_out_are_not_misplaced(tmp_path):
     assert calibration.estimate.configurations.sum() == 3
 
 
+def test_too_few_configurations_to_hold_out_are_refused_before_images_are_read(searched):
+    steps = []
+    with raises(InputError, what="there are too few configurations to hold any out"):
+        calibrate_session(searched[0], holdout=2, progress=lambda step, _: steps.append(step))
+    assert "Reading images" not in steps
+
+
 def test_focal_lengths_are_found_within_their_deviations(breathed):
     calibration, truth = breathed
     stations = calibration_document(calibration)["stations"]
@@ -953,10 +961,7 @@ def test_a_similar_pose_is_distinguished_by_the_machine_there(searched):
 
 def evidence_there(reference_values, view):
     """Log-likelihood ratio of the third image about its pose by the marginal prior."""
-    here = replace(
-        view, machine=reference_values.machine, all_poses=reference_values.T_base_platform
-    )
-    return likelihood_from(here, reference_values.T_camera_base[[2]])
+    return likelihood_from(reference_values.view_in(view), reference_values.T_camera_base[None])
 
 
 def test_images_join_what_is_known(searched):
@@ -971,17 +976,22 @@ def test_images_join_what_is_known(searched):
     assert sorted(names.edges) == [0, 1]
     T = truth.T_camera_base[2]
     view = finest_view(session.machine, at[2], session.joints, poses)
-    right, paid = evaluate_pose(session, names, 2, T, view)
-    assert sorted(right.edges) == [2]
-    assert len(right.edges[2]) > 6
-    # half the squares of its edges' residuals, two numbers each
-    assert paid < len(right.edges[2])
-    other = replace(view, configuration=at[0].configuration)
-    wrong, _ = evaluate_pose(session, names, 2, T, other)
-    assert evidence_there(right, view) > 3 * evidence_there(wrong, other)
     nowhere = perturb(np.eye(4), np.array([np.pi, 0, 0, 0, 0, 0])) @ T
-    with raises(InputError, code="measurements.none"):
-        evaluate_pose(session, names, 2, nowhere, view)
+    near = perturb(T[None], np.array([[0.02, 0, 0, 0, 0, 0]]))[0]
+    right, none, beside = evaluate_poses(session, names, 2, np.stack([T, nowhere, near]), view)
+    assert len(right.edges) > 6
+    # half the squares of its edges' residuals, two numbers each
+    assert right.paid < len(right.edges)
+    assert none.code == "measurements.none"
+    # a pose of a batch has the result that it has alone
+    (alone,) = evaluate_poses(session, names, 2, near[None], view)
+    np.testing.assert_allclose(beside.T_camera_base, alone.T_camera_base, atol=1e-5)
+    assert beside.paid == pytest.approx(alone.paid, rel=1e-3)
+    assert len(beside.edges) == len(alone.edges)
+    other = replace(view, configuration=at[0].configuration)
+    (wrong,) = evaluate_poses(session, names, 2, T[None], other)
+    assert isinstance(wrong, EvaluatedPose)
+    assert evidence_there(right, view) > 3 * evidence_there(wrong, other)
 
 
 @pytest.mark.slow

@@ -437,9 +437,9 @@ def _load(
         session = load_session(session)
     check_observable(session)
     if holdout:
-        from pkmcal.calibration.holdout import check_predictable
+        from pkmcal.calibration.holdout import check_holdout
 
-        check_predictable(session)
+        check_holdout(session, holdout)
     # a pose that the machine cannot reach is reported before any work
     platform_poses(session, most=not legs_stations(session))
     refinement_of(session, refine_camera)

@@ -15,10 +15,9 @@ joint estimate rejects: their pose was wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
-from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -259,13 +258,22 @@ def _searched(
         scored = {k: answer.places for k, answer in answers.items() if answer.scores is not None}
         return stated | scored
 
-    def rescore(some: Sequence[int], text: str, progress: Progress) -> None:
+    def search(
+        one: Callable[[int], _CachedHypotheses], some: Sequence[int], text: str, progress: Progress
+    ) -> None:
+        """Search images side by side; each is counted when it is ready."""
         progress(text, 0.0)
-        search = partial(_search, session, room, so_far)
-        now = pool.map(search, [at[k] for k in some], [answers[k] for k in some])
-        for done, (k, one) in enumerate(zip(some, now, strict=True), start=1):
-            answers[k] = one
+        tasks = {k: pool.submit(one, k) for k in some}
+        for done, _ in enumerate(as_completed(tasks.values()), start=1):
             progress(f"{text}: {done} of {len(some)}", done / len(some))
+        answers.update((k, task.result()) for k, task in tasks.items())
+
+    def rescore(some: Sequence[int], text: str, progress: Progress) -> None:
+        state = so_far
+        search(lambda k: _search(session, room, state, at[k], answers[k]), some, text, progress)
+
+    def register(progress: Progress) -> _LocalizationState:
+        return _with_sure(session, at, room, so_far, accepted_poses(), boards, progress)
 
     def accepted_poses() -> Array:
         return _accepted_poses(
@@ -274,26 +282,21 @@ def _searched(
 
     with ThreadPoolExecutor(THREADS) as pool:
         # each image by itself
-        alone = pool.map(partial(_alone, session, scene), [at[k] for k in by_hand])
-        for k, one in zip(by_hand, alone, strict=True):
-            answers[k] = _CachedHypotheses(one, one)
-            done = len(answers)
-            progress(
-                f"Localizing hand-held images: {done} of {len(by_hand)}", 0.3 * done / len(by_hand)
-            )
+        text = "Localizing hand-held images"
+        search(lambda k: _alone(session, scene, at[k]), by_hand, text, part(progress, 0, 0.3))
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = min((len(clearer) + 1) // 2, _OPTIONS.most_from_nominal)
-        rescore(clearer[:half], "Scoring the least ambiguous images", part(progress, 0.3, 0.42))
-        so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
+        rescore(clearer[:half], "Scoring the least ambiguous images", part(progress, 0.3, 0.36))
+        so_far = register(part(progress, 0.36, 0.43))
         text = f"Scoring the others, with {len(so_far.placed)} images localized"
-        rescore(clearer[half:], text, part(progress, 0.47, 0.6))
+        rescore(clearer[half:], text, part(progress, 0.43, 0.56))
         # join the images of a board, and score images without an accepted pose again
         for k, one in _on_board(hypotheses(), boards).items():
             if k in answers:  # poses that the session states remain
                 answers[k] = replace(answers[k], places=one)
-        so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
-        rest = part(progress, 0.65, 1)
+        so_far = register(part(progress, 0.56, 0.6))
+        rest = part(progress, 0.6, 1)
         for _ in range(_OPTIONS.most_rounds):
             T = accepted_poses()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.with_few_legs]
@@ -301,9 +304,9 @@ def _searched(
                 break
             placed = len(by_hand) - len(unsure)
             text = f"Scoring again, with {placed} of {len(by_hand)} images localized"
-            rescore(unsure, text, part(rest, 0, 0.4))
-            so_far = _with_sure(session, at, room, so_far, accepted_poses(), boards)
-            rest = part(rest, 0.5, 1)
+            rescore(unsure, text, part(rest, 0, 0.7))
+            so_far = register(part(rest, 0.7, 0.8))
+            rest = part(rest, 0.8, 1)
     out = _final_poses(so_far, accepted_poses(), (*by_hand, *stated))
     untested = tuple(_untested(session, so_far, answers, out))
     return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
@@ -410,10 +413,12 @@ def _with_sure(
     so_far: _LocalizationState,
     T_camera_base: Array,
     boards: Boards,
+    progress: Progress,
 ) -> _LocalizationState:
     """State with all accepted images registered; unchanged without new ones.
 
     T_camera_base : (S, 4, 4), NaN for images without an accepted pose.
+    progress : called after each image that is measured.
     """
     scene = so_far.scene
     sure = {k: T for k, T in enumerate(T_camera_base) if k in images and not np.isnan(T).any()}
@@ -421,7 +426,7 @@ def _with_sure(
     if not new:
         return so_far
     try:
-        joined = register_images(session, images, scene, new, boards)
+        joined = register_images(session, images, scene, new, boards, progress)
         # silhouettes match anywhere, legs can be measured at the correct pose only
         with_few_legs = frozenset(
             k
@@ -454,14 +459,14 @@ def _too_few_legs(scene: PriorScene, image: StationImages) -> bool:
     return len(visible) < _fewest_legs(machine)
 
 
-def _alone(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
-    """Pose hypotheses from one image alone, from the cache where it was localized before."""
+def _alone(session: Session, scene: PriorScene, image: StationImages) -> _CachedHypotheses:
+    """Hypotheses from one image alone, from the cache where it was localized before."""
     name = image_name(session, scene.machine, image.station)
     hypotheses = remembered_image(name)
     if hypotheses is None:
         hypotheses = _image_hypotheses(session, scene, image)
         remember_image(name, hypotheses)
-    return hypotheses
+    return _CachedHypotheses(hypotheses, hypotheses)
 
 
 def _image_hypotheses(
@@ -536,7 +541,7 @@ def _by_neighbours(
     away = [np.linalg.norm(one.T_camera_base[:3, 3]) for one in so_far.placed.values()]
     lines = room.relative(p.station, so_far.placed, _OPTIONS.apart * float(np.median(away)))
     view = finest_view(scene.machine, p, session.joints, scene.T_base_platform, tables)
-    return localize_along(view, lines, legs.LEG_SEARCH_OPTIONS.sigma)
+    return localize_along(view, lines)
 
 
 def _legs(

@@ -88,6 +88,18 @@ def check_predictable(session: Session) -> None:
     )
 
 
+def check_holdout(session: Session, n: int) -> None:
+    """Raise InputError, before any image is read, where n poses cannot be held out of a session's
+    images (:func:`chosen`): no more poses are measured than there are images of.
+    """
+    check_predictable(session)
+    if session.trackers or session.links:
+        return
+    rows = sorted({photo.configuration for one in session.stations for photo in one.images})
+    total = len(np.unique(same_pose(session.joints[rows], session.joint_noise)))
+    _check(n, total - n, total, "configurations held out")
+
+
 def points_of_poses(machine: Machine, poses: Array) -> Array:
     """Poses (n, 4, 4) as points (n, 6) in metres: rotations times the platform's radius, then
     positions.

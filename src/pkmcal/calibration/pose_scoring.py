@@ -22,14 +22,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import THREADS, Array
+from pkmcal.arrays import THREADS, Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import PriorScene
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.bundle import Fit, fit_state, marginalize_to_machine
+from pkmcal.identify.bundle import Fit, fit_state, fit_states, marginalize_to_machine
 from pkmcal.identify.start import start_state
+from pkmcal.identify.state import State
 from pkmcal.measurements import EdgeSet, of_stations
+from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.image_batches import StationImages
@@ -49,6 +51,7 @@ from pkmcal.observe.pose_likelihood import (
 )
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.session.load import Session
 
 
@@ -84,6 +87,7 @@ def register_images(
     scene: PriorScene,
     places: Mapping[int, Array],
     boards: Boards,
+    progress: Progress = no_progress,
 ) -> PriorScene:
     """Scene estimated with further images at poses ``places``, T_camera_base (4, 4) by station.
 
@@ -94,19 +98,20 @@ def register_images(
     boards : boards in these images.
     """
     n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
-    every = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
-    again = len(every) >= _OPTIONS.refined_again_growth * len(scene.edges)
-    near, edges = _silhouettes(session, images, scene, every, (every if again else places).keys())
-    updated_scene = scene._replace(prior=None)
-    while True:
-        last, fit = _joint_fit(session, updated_scene, near, edges, boards)
+    near = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
+    again = len(near) >= _OPTIONS.refined_again_growth * len(scene.edges)
+    refined = (near if again else places).keys()
+    scene = scene._replace(prior=None)
+    for number in range(n_passes):
+        measured = part(progress, number / n_passes, (number + 1) / n_passes)
+        near, edges = _silhouettes(session, images, scene, near, refined, measured)
+        last, fit = _joint_fit(session, scene, near, edges, boards)
         # scatter of the silhouettes from their residuals, relative to the stated sigmas
-        updated_scene = last._replace(scatter=updated_scene.scatter * fit.edge_scale)
-        n_passes -= 1
-        if not n_passes:
-            return updated_scene._replace(prior=marginalize_to_machine(fit.info))
-        near = {k: updated_scene.T_camera_base[k] for k in near}
-        near, edges = _silhouettes(session, images, updated_scene, near, ())
+        scene = last._replace(scatter=scene.scatter * fit.edge_scale)
+        if number + 1 == n_passes:
+            scene = scene._replace(prior=marginalize_to_machine(fit.info))
+        near, refined = {k: scene.T_camera_base[k] for k in near}, ()
+    return scene
 
 
 def _silhouettes(
@@ -115,10 +120,12 @@ def _silhouettes(
     scene: PriorScene,
     places: Mapping[int, Array],
     refined: Collection[int],
+    progress: Progress,
 ) -> tuple[dict[int, Array], dict[int, EdgeSet]]:
     """Poses T_camera_base (4, 4) and silhouettes of images, by station, several images at a time.
 
     places : poses by station. refined : stations of which the likeliest pose near it is taken.
+    progress : called after each image.
     """
 
     def measure(k: int) -> tuple[Array, EdgeSet]:
@@ -126,36 +133,73 @@ def _silhouettes(
         view = finest_view(scene.machine, images[k], session.joints, scene.T_base_platform)
         T = places[k]
         if k in refined:
-            T = refine_local(view, T, _OPTIONS.silhouette_scatter)[0]
+            T = refine_local(view, T[None], _OPTIONS.silhouette_scatter)[0][0]
         return T, silhouette_edges(view, T, k).edges.scaled(scene.scatter)
 
-    stations = sorted(places)
+    poses, edges, stations = dict[int, Array](), dict[int, EdgeSet](), sorted(places)
+    text = f"Estimating {len(stations)} localized images together"
     with ThreadPoolExecutor(THREADS) as pool:
-        measured = list(pool.map(measure, stations))
-    poses = {k: T for k, (T, _) in zip(stations, measured, strict=True)}
-    return poses, {k: edges for k, (_, edges) in zip(stations, measured, strict=True)}
+        for k, one in zip(stations, pool.map(measure, stations), strict=True):
+            poses[k], edges[k] = one
+            progress(text, len(poses) / len(stations))
+    return poses, edges
 
 
-def evaluate_pose(
+class EvaluatedPose(NamedTuple):
+    """Estimate with one image at a camera pose.
+
+    state : of this image alone; poses of other configurations are those of the start.
+    edges : silhouettes of the image.
+    paid : cost of the machine's change, half the sum of squares by which the parameters and the
+        joint readings are moved.
+    """
+
+    machine: Machine
+    state: State
+    edges: EdgeSet
+    paid: float
+
+    @property
+    def T_camera_base(self) -> Array:
+        """Pose (4, 4) of the camera."""
+        return self.state.T_camera_base[0]
+
+    def view_in(self, view: StationView) -> StationView:
+        """View of the image with this machine."""
+        return replace(view, machine=self.machine, all_poses=self.state.T_base_platform)
+
+
+def evaluate_poses(
     session: Session, scene: PriorScene, station: int, T_camera_base: Array, view: StationView
-) -> tuple[PriorScene, float]:
-    """Scene estimated with one image at a camera pose (4, 4), and the cost of the machine's change.
+) -> list[EvaluatedPose | PkmcalError]:
+    """The scene estimated with one image at each of several camera poses (n, 4, 4), as runs of one
+    batch; the error of each that has none, because too few legs are measured.
 
-    The cost is half the sum of squares by which the parameters and the joint readings are moved.
     Images with accepted poses enter by their marginal prior, so the effort does not depend on their
-    number. Boards are left out: the score is about the legs. Raises a `PkmcalError` if too few legs
-    are measured.
+    number. Boards are left out: the score is about the legs.
 
     view : of this image.
     """
-    paid = 0.0
+    only = replace(session.of_stations([station]), trackers=(), links=())
+    nothing = measurements_of(only, Boards())
+    begin = start_state(scene.machine, nothing, T_camera_base[:1])
+    results: list[EvaluatedPose | PkmcalError] = [
+        EvaluatedPose(scene.machine, replace(begin, T_camera_base=T[None]), EdgeSet.empty(), 0.0)
+        for T in T_camera_base
+    ]
     for _ in range(_OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal):
-        view = replace(view, machine=scene.machine, all_poses=scene.T_base_platform)
-        edges = silhouette_edges(view, T_camera_base, station).edges.scaled(scene.scatter)
-        near = {station: T_camera_base}
-        scene, fit = _joint_fit(session, scene, near, {station: edges}, Boards())
-        T_camera_base, paid = scene.T_camera_base[station], fit.change
-    return scene, paid
+        before = {k: one for k, one in enumerate(results) if isinstance(one, EvaluatedPose)}
+        edges = [
+            silhouette_edges(one.view_in(view), one.T_camera_base, 0).edges.scaled(scene.scatter)
+            for one in before.values()
+        ]
+        measurements = [replace(nothing, edges=own) for own in edges]
+        starts = [one.state for one in before.values()]
+        fits = fit_states(session.machine, measurements, starts, scene.prior)
+        for k, own, fit in zip(before, edges, fits, strict=True):
+            failed = isinstance(fit, PkmcalError)
+            results[k] = fit if failed else EvaluatedPose(fit.machine, fit.state, own, fit.change)
+    return results
 
 
 def _joint_fit(
@@ -226,7 +270,7 @@ def rescore_poses(
     tables : finest distance tables of the image, computed if None.
     """
     p = image.decoded()
-    one = np.zeros(1, dtype=int)
+    first, scatter = np.zeros(1, dtype=int), _OPTIONS.silhouette_scatter
     view = finest_view(before.machine, p, session.joints, before.T_base_platform, tables)
     # candidates, refined with the machine as it is known
     near = (
@@ -235,22 +279,21 @@ def rescore_poses(
     )
     places = np.concatenate([hypotheses.T_camera_base[near][: _OPTIONS.candidates], others])
     # maximum likelihood with the machine unchanged; a changed machine is tried below
-    settled, log_likelihood_ratio = refine_ml(view, places, one, 16, 6, _OPTIONS.silhouette_scatter)
-    if before.edges:  # the machine changes little: search around the likeliest poses
-        # equal poses have the same likelier one near them
-        order = np.argsort(-log_likelihood_ratio, kind="stable")
-        order = order[distinct_silhouettes(view, settled[order], one)]
-        for k in order[: _OPTIONS.refined_locally]:
-            settled[k], log_likelihood_ratio[k] = refine_local(
-                view, settled[k], _OPTIONS.silhouette_scatter
-            )
-        places = settled
-    # drop poses that were scored before
+    settled, log_likelihood_ratio = refine_ml(view, places, first, 16, 6, scatter)
     previous = ScoredPoses.nothing() if scores is None else scores
-    order = np.argsort(-log_likelihood_ratio, kind="stable")
-    both = np.concatenate([previous.T_camera_base, settled[order]])
     count = len(previous.T_camera_base)
-    order = order[[k - count for k in distinct_silhouettes(view, both, one) if k >= count]]
+
+    def unscored() -> Integers:
+        """Rows of the distinct poses that were not scored before, the likeliest first."""
+        order = np.argsort(-log_likelihood_ratio, kind="stable")
+        both = np.concatenate([previous.T_camera_base, settled[order]])
+        return order[[k - count for k in distinct_silhouettes(view, both, first) if k >= count]]
+
+    if before.edges:  # the machine changes little: search around the likeliest poses
+        best = unscored()[: _OPTIONS.refined_locally]
+        settled[best], log_likelihood_ratio[best] = refine_local(view, settled[best], scatter)
+        places = settled
+    order = unscored()
     at, fits = (
         [*previous.T_camera_base, *settled[order]],
         [*previous.scores, *log_likelihood_ratio[order]],
@@ -258,20 +301,17 @@ def rescore_poses(
     paid = [*previous.paid, *np.zeros(len(order))]
     failures = [*previous.failures]
     # estimate the machine with the camera at each remaining pose
-    for number, T in enumerate(places[order], start=count):
-        best = max(fit / hypotheses.unit - cost for fit, cost in zip(fits, paid, strict=True))
-        if before.edges and fits[number] / hypotheses.unit < best - _OPTIONS.most_behind_best:
-            break  # the prior does not allow a change that large
-        try:
-            scene, cost = evaluate_pose(session, before, p.station, T, view)
-        except PkmcalError as error:  # such as too few legs measured
-            failures.append(str(error))
+    tried = places[order]
+    if before.edges:  # the prior allows no large change
+        worth = np.array(fits) / hypotheses.unit - paid
+        tried = tried[worth[count:] >= worth.max() - _OPTIONS.most_behind_best]
+    for one in evaluate_poses(session, before, p.station, tried, view):
+        if isinstance(one, PkmcalError):  # such as too few legs measured
+            failures.append(str(one))
             continue
-        changed = replace(view, machine=scene.machine, all_poses=scene.T_base_platform)
-        there, fit = refine_ml(
-            changed, scene.T_camera_base[[p.station]], one, 16, 6, _OPTIONS.silhouette_scatter
-        )
-        at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
+        T, changed = one.T_camera_base[None], one.view_in(view)
+        there, fit = refine_ml(changed, T, first, 16, 6, scatter)
+        at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, one.paid]
     previous = ScoredPoses(np.stack(at), np.array(fits), np.array(paid), tuple(failures))
     return _weighed(view, previous, hypotheses.unit), previous
 

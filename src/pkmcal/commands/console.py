@@ -146,16 +146,19 @@ def _progress_lines() -> Generator[Progress]:
     """Context with a progress callback that prints lines at intervals; short commands print
     none.
     """
-    begin, over, step = time.monotonic(), threading.Event(), [("", 0.0, "")]
+    begin, over, step = time.monotonic(), threading.Event(), [("", 0.0)]
     estimate = RemainingTime()
 
     def report(text: str, share: float) -> None:
-        step[0] = text, share, estimate.text(share, time.monotonic())
+        step[0] = text, share
+        estimate.text(share, time.monotonic())
 
     def print_lines() -> None:
         while not over.wait(PROGRESS_LINE_INTERVAL):
-            text, share, remaining = step[0]
+            text, share = step[0]
             if text:
+                # again, because a long step leaves more time than its beginning promised
+                remaining = estimate.text(share, time.monotonic())
                 times = [f"{time.monotonic() - begin:.0f} s", *([remaining] if remaining else [])]
                 sys.stderr.write(f"{legible(text)} ({', '.join([percentage(share), *times])})\n")
 
@@ -172,22 +175,29 @@ def _progress_lines() -> Generator[Progress]:
 class RemainingTime:
     """Estimate of a task's remaining time from the time since its first step.
 
-    Until that step the program is loaded, which takes no share.
+    Until that step the program is loaded, which takes no share. A large share that is done in no
+    time was cached, and does not show how long the rest takes.
     """
 
     def __init__(self) -> None:
         self._began: float | None = None
+        self._last, self._cached = (0.0, 0.0), 0.0
 
     def text(self, share: float, now: float) -> str:
         """Remaining time in words, empty where too little is done; now : clock, s."""
         began = self._began
         if began is None or not share:
-            self._began = now
+            self._began, self._last = now, (share, now)
             return ""
-        passed = now - began
-        if share < SMALLEST_SHARE_FOR_ESTIMATE or passed < SHORTEST_TIME_FOR_ESTIMATE:
+        step, wait = share - self._last[0], now - self._last[1]
+        if step > SMALLEST_SHARE_FOR_ESTIMATE and 0 <= wait < SHORTEST_TIME_FOR_ESTIMATE:
+            self._cached += step
+        if step:
+            self._last = share, now
+        passed, done = now - began, share - self._cached
+        if done < SMALLEST_SHARE_FOR_ESTIMATE or passed < SHORTEST_TIME_FOR_ESTIMATE:
             return ""
-        minutes, seconds = divmod(round(passed * (1 - share) / share), 60)
+        minutes, seconds = divmod(round(passed * (1 - share) / done), 60)
         return f"{minutes}:{seconds:02d} left"
 
 

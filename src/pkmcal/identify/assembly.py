@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from pkmcal.identify.places import Places
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import SHADING_SIGMA, Column, Measurements
+from pkmcal.measurements import SHADING_SIGMA, Column, Measurements, edges_of_any
 from pkmcal.measurements.edges import EdgeBlocks, EdgeData
 from pkmcal.measurements.effects import SHADING, columns_of_effects, lines
 from pkmcal.measurements.line_cells import LineCells
@@ -73,7 +73,7 @@ def assemble(
     Raises InputError if there is no measurement, or if readings and indices do not match the
     machine.
     """
-    _check(machine, measurements)
+    check_measurements(machine, measurements)
     # configurations in the problem, and the effects that are unknowns
     observed = observed_configurations(measurements)
     columns = _unknown_columns(measurements)
@@ -130,6 +130,27 @@ def assemble(
     return Assembled(problem, observed, RowGroups(edges, poses, link_blocks.at), kinds)
 
 
+def assemble_runs(
+    machine: Machine, measurements: Sequence[Measurements], gauge: Gauge
+) -> Assembled:
+    """Joint problem of runs that differ in their edges, each as by :func:`assemble`.
+
+    All runs have the edges of any of them. Where a run has not measured an edge, its whitening is
+    zero (:attr:`RowGroup.measured`).
+    """
+    own = edges_of_any([one.edges for one in measurements])
+    runs = [replace(one, edges=edges) for one, (edges, _) in zip(measurements, own, strict=True)]
+    first, parts = assemble(machine, runs[0], gauge), list[EdgeData]()
+    at = first.places.edges
+    for one, (_, measured) in zip(runs, own, strict=True):
+        data = _edges(machine, one, _unknown_columns(one), at, first.observed, share=1.0)[1]
+        present = at.filled(measured.astype(float))[None, ..., None, None]
+        parts.append(replace(data, white=data.white * present))
+    names = [one.name for one in fields(EdgeData)]
+    data = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    return replace(first, problem=replace(first.problem, data=EdgeData(*data)))
+
+
 def observed_configurations(measurements: Measurements) -> Booleans:
     """(K,) configurations with a measurement that depends on the platform's pose; all where only
     readings were measured.
@@ -144,7 +165,10 @@ def observed_configurations(measurements: Measurements) -> Booleans:
     return np.bincount(rows, minlength=n) > 0
 
 
-def _check(machine: Machine, measurements: Measurements) -> None:
+def check_measurements(machine: Machine, measurements: Measurements) -> None:
+    """Raise `InputError` if nothing is measured, or if readings and indices do not match the
+    machine.
+    """
     edges, joints = measurements.edges, measurements.joints
     in_view = len(edges) + len(measurements.poses) + measurements.n_links
     if measurements.n_stations and not in_view:

@@ -6,6 +6,7 @@ poses, links, readings and the nominal model, each divided by its standard devia
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -13,8 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.errors import ResultError
-from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
+from pkmcal.errors import PkmcalError, ResultError
+from pkmcal.identify.assembly import (
+    Assembled,
+    assemble,
+    assemble_runs,
+    batch_of,
+    check_measurements,
+    state_of,
+)
 from pkmcal.identify.covariance import (
     Information,
     covariance_by_noise,
@@ -60,13 +68,21 @@ from pkmcal.identify.row_sums import (
 )
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.state import State
-from pkmcal.identify.unknowns import BatchState
+from pkmcal.identify.unknowns import BatchState, batch_of_runs
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.effects import SHADING, SHIFT_SIGMA
 from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import rank_of_normal
-from pkmcal.solver.search import SEARCH, STEP_TOLERANCE, SearchOptions, Solution, Stop, minimise
+from pkmcal.solver.search import (
+    SEARCH,
+    STEP_TOLERANCE,
+    SearchOptions,
+    Solution,
+    Stop,
+    minimise,
+    take,
+)
 
 
 @dataclass(frozen=True)
@@ -191,8 +207,7 @@ def solve_batch(
     """
     n_runs = start.z.shape[0]
     ones = RowGroups(*(np.ones(n_runs) for _ in problem.row_groups))
-    present = (kind.present.astype(float) for kind in problem.row_groups)
-    every = RowGroups(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
+    every = RowGroups(*(kind.ones(n_runs) for kind in problem.row_groups))
     # The shading starts with the prior of a whole camera's shift: a narrow prior would make
     # outliers of edges that contradict it.
     n_lines = problem.shading.shape[1]
@@ -646,21 +661,73 @@ def fit_state(
     assembled, result = _assembled_fit(
         machine, measurements, start, gauge, marginal_prior, scale_readings=scale_readings
     )
-    problem = result.info.problem
-    state = in_gauge(machine, state_of(assembled, result.solution.state, start), gauge)
-    state = replace(state, theta=machine.parameters.unit_axes(state.theta))
-    identified = machine.with_values(state.theta)
+    (fit,) = _fits(machine, [start], assembled, result, gauge)
+    state = _with_unseen_poses(fit.machine, measurements, assembled, fit.state)
+    return fit._replace(state=state)
+
+
+def fit_states(
+    machine: Machine,
+    measurements: Sequence[Measurements],
+    starts: Sequence[State],
+    marginal_prior: MarginalPrior | None = None,
+) -> list[Fit | PkmcalError]:
+    """Estimates as by :func:`fit_state` of trials that differ in their edges and starts, as runs of
+    one batch; the error of each that has none.
+
+    Poses of configurations without measurements remain those of the start.
+
+    measurements : without boards and trackers, edges of the same configurations.
+    """
+    gauge, errors = default_gauge(machine), dict[int, PkmcalError]()
+    for k, one in enumerate(measurements):
+        try:
+            check_measurements(machine, one)
+        except PkmcalError as error:
+            errors[k] = error
+    runs = [k for k in range(len(starts)) if k not in errors]
+    fits = dict[int, Fit | PkmcalError](errors)
+    if runs:
+        begin = [starts[k] for k in runs]
+        assembled = assemble_runs(machine, [measurements[k] for k in runs], gauge)
+        problem, batch = _prepared(machine, assembled, begin, marginal_prior)
+        result = solve_batch(problem, batch, scale_readings=False)
+        fits |= zip(runs, _fits(machine, begin, assembled, result, gauge), strict=True)
+        for k, stop in zip(runs, result.solution.stop, strict=True):
+            if stop in (Stop.NOT_FINITE, Stop.STALLED):
+                fits[k] = _failed(stop)
+    return [fits[k] for k in range(len(starts))]
+
+
+def _fits(
+    machine: Machine,
+    starts: Sequence[State],
+    assembled: Assembled,
+    result: BatchResult,
+    gauge: Gauge,
+) -> list[Fit]:
+    """Fits of all runs of a result; poses of unobserved configurations are those of the starts."""
+    problem, batch = result.info.problem, result.solution.state
     value = result.info.by_kind.value
     drawn = ~np.isin(assembled.priors, ("gauge", "mount"))
-    prior = problem.prior_values(result.info.state)[0] - problem.prior_target
-    change = np.sum(value[..., problem.closure_rows] ** 2) + np.sum(prior[drawn] ** 2)
-    edge_rows = problem.row_groups.edges.rows
-    chi2 = float(np.sum(result.edges.squares(problem.blocks, value[..., edge_rows])))
-    freedom = float(result.components.freedom[0, EDGE_ROWS])
-    scale = np.sqrt(chi2 / freedom) if freedom > LEAST_NOISE_FREEDOM else 1.0
-    state = _with_unseen_poses(identified, measurements, assembled, state)
-    info = Information(problem, batch_of(identified, replace(assembled, problem=problem), state))
-    return Fit(identified, state, float(change) / 2, float(scale), info)
+    prior = (problem.prior_values(batch) - problem.prior_target)[:, drawn]
+    change = np.sum(value[..., problem.closure_rows] ** 2, axis=(1, 2)) + np.sum(prior**2, axis=-1)
+    edge_rows = value[..., problem.row_groups.edges.rows]
+    chi2 = np.sum(result.edges.squares(problem.blocks, edge_rows), axis=(1, 2))
+    freedom = result.components.freedom[:, EDGE_ROWS]
+    scale = np.where(
+        freedom > LEAST_NOISE_FREEDOM, np.sqrt(chi2 / np.maximum(freedom, LEAST_NOISE_FREEDOM)), 1.0
+    )
+    fits: list[Fit] = []
+    for k, start in enumerate(starts):
+        run = np.array([k])
+        state = in_gauge(machine, state_of(assembled, take(batch, run), start), gauge)
+        state = replace(state, theta=machine.parameters.unit_axes(state.theta))
+        identified, own = machine.with_values(state.theta), problem.select(run)
+        there = batch_of(identified, replace(assembled, problem=own), state)
+        info = Information(own, there)
+        fits.append(Fit(identified, state, float(change[k]) / 2, float(scale[k]), info))
+    return fits
 
 
 def _assembled_fit(
@@ -681,7 +748,33 @@ def _assembled_fit(
     assembled = assemble(
         machine, measurements, gauge, use_prior=use_prior or marginal_prior is not None
     )
-    batch = batch_of(machine, assembled, start)
+    problem, batch = _prepared(machine, assembled, [start], marginal_prior)
+    result = solve_batch(problem, batch, hopeless=hopeless, **options)
+    # a failed search is an error, not a result
+    if result.scale.poses[0] > hopeless:
+        raise ResultError(
+            what="the measured poses do not fit the machine",
+            found=f"{result.scale.poses[0]:.0f} times their noise after a first search",
+        )
+    stop = result.solution.stop[0]
+    if stop in (Stop.NOT_FINITE, Stop.STALLED):
+        raise _failed(stop)
+    return assembled, result
+
+
+def _failed(stop: Stop) -> ResultError:
+    """Error of a search that did not converge."""
+    return ResultError(what=f"the joint estimate failed: {stop.value}")
+
+
+def _prepared(
+    machine: Machine,
+    assembled: Assembled,
+    starts: Sequence[State],
+    marginal_prior: MarginalPrior | None,
+) -> tuple[Problem, BatchState]:
+    """Problem with the priors of mounts and of the machine, and the starts of its runs."""
+    batch = batch_of_runs([batch_of(machine, assembled, start) for start in starts])
     problem = assembled.problem
     # the prior of mounts is centred at their start
     mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
@@ -695,17 +788,7 @@ def _assembled_fit(
             marginal_prior.root @ marginal_prior.free,
         )
         problem = replace(problem, prior=prior, prior_target=target)
-    result = solve_batch(problem, batch, hopeless=hopeless, **options)
-    # a failed search is an error, not a result
-    if result.scale.poses[0] > hopeless:
-        raise ResultError(
-            what="the measured poses do not fit the machine",
-            found=f"{result.scale.poses[0]:.0f} times their noise after a first search",
-        )
-    stop = result.solution.stop[0]
-    if stop in (Stop.NOT_FINITE, Stop.STALLED):
-        raise ResultError(what=f"the joint estimate failed: {stop.value}")
-    return assembled, result
+    return problem, batch
 
 
 def _estimate(

@@ -125,7 +125,10 @@ class Information:
         else:
             inverse, sure = self._inverse
             if sure.all():
-                return np.linalg.cholesky(inverse)
+                try:
+                    return np.linalg.cholesky(inverse)
+                except np.linalg.LinAlgError:
+                    pass  # the rounding of a matrix with huge derivatives made it indefinite
         return normal_root(normal, NORMAL_RANK_TOLERANCE, loose=False)
 
     @cached_property

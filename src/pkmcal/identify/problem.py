@@ -356,7 +356,8 @@ class Problem:
         """Numbers of the strips, (B, d + w + 1, N, n).
 
         Derivatives by the d own unknowns and by the w ``strip_parameters`` of the structure, and
-        the residuals; zero where they are not finite. value : (B, N, n) residuals of the N views.
+        the residuals; zero where these are not finite or have no weight. value : (B, N, n)
+        residuals of the N views.
         """
         # derivatives by own unknowns, both ends, station, radii and effects, written in place
         by_columns, ends_by = edges.data.by_columns, edges.ends_by(self.layout.freedoms)
@@ -372,7 +373,8 @@ class Problem:
         np.multiply(edges.by_radius()[:, None], tube, out=of_radius)
         of_columns[...] = by_columns.swapaxes(0, 1)
         numbers[:, -1] = value
-        lost = ~np.isfinite(value)
+        # an edge without weight may have an infinite derivative
+        lost = ~(np.isfinite(value) & edges.data.counts)
         if lost.any():
             np.copyto(numbers, 0.0, where=lost[:, None])
         # tied parameters and axes: from derivatives by parameters to those by unknowns

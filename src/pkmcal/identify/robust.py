@@ -113,14 +113,14 @@ def as_pairs(kind: RowGroup) -> Array:
 
 def norms(problem: Problem, rows: RowGroups[Array]) -> RowGroups[Array]:
     """Mahalanobis norms (B, K, G) of each kind, converted to those of pairs (:func:`as_pairs`); NaN
-    for padding.
+    where nothing was measured.
 
     rows : unweighted residuals (:meth:`Problem.unweighted`).
     """
     parts = zip(problem.row_groups, rows, strict=True)
     return RowGroups(
         *(
-            np.where(kind.present, np.sqrt(np.sum(own**2, axis=-1)) * as_pairs(kind), np.nan)
+            np.where(kind.measured, np.sqrt(np.sum(own**2, axis=-1)) * as_pairs(kind), np.nan)
             for kind, own in parts
         )
     )
@@ -227,7 +227,7 @@ def robust_start(
     annealed = anneal(problem, start, options)
     # runs in which the annealing rejects measurements
     rejects = [
-        np.any(kind.present & (weight < INLIER_WEIGHT), axis=(1, 2))
+        np.any(kind.measured & (weight < INLIER_WEIGHT), axis=(1, 2))
         for kind, weight in zip(problem.row_groups, annealed.weight, strict=True)
     ]
     runs = np.flatnonzero(np.any(rejects, axis=0))
@@ -236,8 +236,7 @@ def robust_start(
     part, state = problem.select(runs), take(annealed.state, runs)
     usual, _, _ = robust_cost(part, state, scaled=scaled, options=options)
     # second start: all measurements at full weight
-    every = (np.broadcast_to(k.present, (len(runs), *k.present.shape)) for k in problem.row_groups)
-    every = RowGroups(*(p.astype(float) for p in every))
+    every = RowGroups(*(kind.ones(len(runs)) for kind in part.row_groups))
     other = RobustStart(state, every, RowGroups(*(np.ones(len(runs)) for _ in every)), 0)
     poses, before = bool(problem.row_groups.poses.present.any()), np.full(len(runs), np.inf)
     for _ in range(options.most_reweightings):

@@ -18,7 +18,8 @@ and, on an articulated platform, its hinges
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
@@ -136,3 +137,9 @@ class BatchState:
         for name, shape in none.items():
             if len(getattr(self, name)) != len(self.z):
                 object.__setattr__(self, name, np.zeros((len(self.z), *shape)))
+
+
+def batch_of_runs(states: Sequence[BatchState]) -> BatchState:
+    """Runs of several batches as one."""
+    names = [one.name for one in fields(BatchState)]
+    return BatchState(*(np.concatenate([getattr(x, name) for x in states]) for name in names))

@@ -12,6 +12,7 @@ from pkmcal.measurements.sets import (
     Observation,
     Set,
     concatenate,
+    edges_of_any,
     of_stations,
 )
 
@@ -32,5 +33,6 @@ __all__ = [
     "Rejection",
     "Set",
     "concatenate",
+    "edges_of_any",
     "of_stations",
 ]

@@ -48,7 +48,16 @@ class RowGroup:
         """Number (K, G) of residuals of each measurement: six for a board's pose, three for a
         point, none for padding.
         """
-        return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)
+        return np.any(self.whiten != 0, axis=-1).sum(axis=-1).max(axis=0)
+
+    @property
+    def measured(self) -> Booleans:
+        """Whether a run has a measurement at a place, (B or 1, K, G): its whitening is not zero."""
+        return self.present & np.any(self.whiten != 0, axis=(-2, -1))
+
+    def ones(self, n_runs: int) -> Array:
+        """Full weights (B, K, G) of all measurements; zero where there is none."""
+        return np.broadcast_to(self.measured, (n_runs, *self.present.shape)).astype(float)
 
 
 def among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:

@@ -71,6 +71,25 @@ def of_stations(edges: Mapping[int, EdgeSet]) -> EdgeSet:
     return concatenate([replace(e, station=np.full(len(e), k)) for k, e in edges.items()])
 
 
+def edges_of_any(sets: Sequence[EdgeSet]) -> list[tuple[EdgeSet, Booleans]]:
+    """Each of several sets with the edges of any of them, in one order, and which are its own.
+
+    Edges are equal as by :meth:`EdgeSet.same_as`; those of other sets have the values there.
+    """
+    every = concatenate(sets)
+    keys = np.stack([every.station, every.configuration, every.leg, every.tube, every.side], axis=1)
+    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    number = number.reshape(-1)
+    results: list[tuple[EdgeSet, Booleans]] = []
+    stop = 0
+    for edges in sets:
+        start, stop = stop, stop + len(edges)
+        place, own = first.copy(), np.zeros(len(first), dtype=bool)
+        place[number[start:stop]], own[number[start:stop]] = np.arange(start, stop), True
+        results.append((every.select(place), own))
+    return results
+
+
 BOARD_MOUNT_NAME = "board"
 """Name of the mount of a session's board."""
 

@@ -44,6 +44,7 @@ from pkmcal.observe.pose_likelihood import (
     StationView,
     distances_under,
     distinct_silhouettes,
+    divided,
     mixture_of,
     refine_lm,
     refine_ml,
@@ -266,58 +267,61 @@ def finest_view(
     return StationView(machine, image.camera, image.configuration, joints, poses, tables)
 
 
-def refine_local(
-    view: StationView,
-    T_camera_base: Array,
-    scatter: float,
-) -> tuple[Array, float]:
-    """Likeliest pose near another (4, 4), and its log-likelihood ratio.
+def refine_local(view: StationView, T_camera_base: Array, scatter: float) -> tuple[Array, Array]:
+    """Likeliest poses near others (n, 4, 4), and their log-likelihood ratios (n,).
 
     After a localization with the nominal model, some legs may be matched to the wrong side of a
-    tube; random starts around the pose find the correct match.
+    tube; random starts around a pose find the correct match.
 
     scatter : as the parameter ``widest`` of :func:`refine_ml`.
     """
-    options = IMAGE_LOCALIZATION_OPTIONS
-    rng, one = np.random.default_rng(0), np.zeros(1, dtype=int)
-    best, most = T_camera_base, -np.inf
+    options, one = IMAGE_LOCALIZATION_OPTIONS, np.zeros(1, dtype=int)
+    rngs = [np.random.default_rng(0) for _ in T_camera_base]
+    best, most = T_camera_base.copy(), np.full(len(T_camera_base), -np.inf)
+    gains = np.arange(len(best))  # poses that the last round has improved
     for _ in range(options.near_rounds):
-        starts = _starts_near(view, best, rng, options)
-        starts, log_likelihood_ratio = refine_ml(view, starts, one, 8, 6)
-        starts = starts[np.argsort(-log_likelihood_ratio)[: options.near_refined]]
-        starts, log_likelihood_ratio = refine_ml(view, starts, one, 16, 10, scatter)
-        k = int(np.argmax(log_likelihood_ratio))
-        if log_likelihood_ratio[k] < most + view.options.least_gain:
+        if not gains.size:
             break
-        best, most = starts[k], float(log_likelihood_ratio[k])
+        # starts about each pose, side by side; the likeliest of each are refined to the end
+        starts = np.concatenate([_starts_near(view, best[k], rngs[k], options) for k in gains])
+        starts, value = refine_ml(view, starts, one, 8, 6)
+        starts, _ = _likeliest(starts, value, len(gains), options.near_refined)
+        starts, value = refine_ml(view, starts, one, 16, 10, scatter)
+        starts, value = _likeliest(starts, value, len(gains), 1)
+        better = value >= most[gains] + view.options.least_gain
+        gains = gains[better]
+        best[gains], most[gains] = starts[better], value[better]
     return best, most
+
+
+def _likeliest(poses: Array, likelihood: Array, count: int, keep: int) -> tuple[Array, Array]:
+    """The ``keep`` likeliest of each of ``count`` equal groups of poses (H, 4, 4), one group after
+    the other, and their likelihoods.
+    """
+    by_group = likelihood.reshape(count, -1)
+    order = np.argsort(-by_group, axis=1, kind="stable")[:, :keep]
+    rows = (order + by_group.shape[1] * np.arange(count)[:, None]).ravel()
+    return poses[rows], likelihood[rows]
 
 
 def localize_along(
     view: StationView,
     T_camera_base: Array,
-    scatter: float,
     options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
 ) -> Array:
-    """Likeliest poses (n, 4, 4) on N lines of poses (N, D, 4, 4), such as a camera's at unknown
-    distance in a given direction; equal ones once.
+    """Likeliest pose on each of N lines of poses (N, D, 4, 4), such as a camera's at unknown
+    distance in a given direction; equal ones once, (n, 4, 4).
 
-    view : with the finest tables. scatter : as of :func:`refine_local`.
+    view : with the finest tables.
     """
-    one = np.zeros(1, dtype=int)
-    if not len(T_camera_base):
-        return np.zeros((0, 4, 4))
-    best: list[Array] = []
-    likelihood: list[float] = []
-    for line in T_camera_base:
-        starts = _most(view, line, 8, options.on_line)
-        starts, log_likelihood_ratio = refine_ml(view, starts, one, 8, 6)
-        best.append(starts[np.argmax(log_likelihood_ratio)])
-        likelihood.append(float(log_likelihood_ratio.max()))
-    # lines that lead to the same pose: the likeliest of them
-    starts = np.stack(best)[np.argsort(-np.array(likelihood), kind="stable")]
-    starts = starts[distinct_silhouettes(view, starts, one)]
-    return np.stack([refine_local(view, start, scatter)[0] for start in starts])
+    one, count, poses = np.zeros(1, dtype=int), len(T_camera_base), T_camera_base.reshape(-1, 4, 4)
+    if not count:
+        return poses
+    starts, _ = _likeliest(poses, _log_likelihood(view, poses, 8), count, options.on_line)
+    starts, likelihood = refine_ml(view, starts, one, 8, 6)
+    starts, likelihood = _likeliest(starts, likelihood, count, 1)
+    starts = starts[np.argsort(-likelihood, kind="stable")]
+    return starts[distinct_silhouettes(view, starts, one)]
 
 
 def localize_near(
@@ -386,6 +390,9 @@ def _log_likelihood(view: StationView, values: Array, samples: int) -> Array:
     """Log-likelihood ratios (H,) of poses (H, 4, 4) by the silhouettes that no other leg hides or
     borders: with two legs on one line in the image, its edges would count twice.
     """
+    parts = divided(view, len(values), samples)
+    if len(parts) > 1:
+        return np.concatenate([_log_likelihood(view, values[k], samples) for k in parts])
     one = np.zeros(1, dtype=int)
     distances = distances_under(view, values, one, samples)
     legs = view.legs(one).under(values)[:, 0]

@@ -218,7 +218,7 @@ def score(
     reach : truncation distance, reduced pixels.
     samples : points along an edge.
     """
-    parts = _parts(view, len(T_camera_base), len(images) * samples)
+    parts = divided(view, len(T_camera_base), len(images) * samples)
     if len(parts) > 1:
         return np.concatenate(
             [score(view.guess(k), T_camera_base[k], images, reach, samples) for k in parts]
@@ -464,7 +464,7 @@ def log_likelihood_by_name(view: StationView, T_camera_base: Array, names: Integ
     points = edge_points(view.machine, view.camera, legs, view.tubes, 8)
     direction = view.tables.direction(points.outward)
     fits: list[Array] = []
-    for part in _parts(view, len(every), len(names) * 8):
+    for part in divided(view, len(every), len(names) * 8):
         number = every[part, None, None, None]
         distance, inside = view.tables.look_up(direction, points.pixel, number, between=True)
         named = _distances(view, points, direction, distance, inside & points.valid)
@@ -500,7 +500,7 @@ def correlation_length(view: StationView, T_camera_base: Array) -> float:
     return float(in_view.mean()) / 2 if in_view.size else 1.0
 
 
-def _parts(view: StationView, count: int, places: int) -> list[slice]:
+def divided(view: StationView, count: int, places: int) -> list[slice]:
     """Slices of ``count`` hypotheses, or images, that are processed together, with ``places``
     points on each edge.
     """
@@ -514,7 +514,7 @@ def distances_under(
     view: StationView, candidates: Array, images: Integers, samples: int
 ) -> Distances:
     """Distances at the edges predicted from poses (H, 4, 4)."""
-    parts = _parts(view, len(candidates), len(images) * samples)
+    parts = divided(view, len(candidates), len(images) * samples)
     if len(parts) > 1:
         each = [distances_under(view.guess(k), candidates[k], images, samples) for k in parts]
         return Distances(*map(np.concatenate, zip(*each, strict=True)))
@@ -533,7 +533,7 @@ def coinciding_edges(view: StationView, candidates: Array, images: Integers, sam
     (:func:`~pkmcal.observe.image_localization.weighed_poses`), loses evidence of stations: a
     mirrored hexapod is then taken for one numbered backwards.
     """
-    parts = _parts(view, len(candidates), len(images) * samples * 4)
+    parts = divided(view, len(candidates), len(images) * samples * 4)
     if len(parts) > 1:
         return np.concatenate(
             [coinciding_edges(view.guess(k), candidates[k], images, samples) for k in parts]
@@ -561,7 +561,7 @@ def linearize_distances(
     view: StationView, candidates: Array, images: Integers, samples: int
 ) -> _Linearization:
     """Distances at the edges predicted from poses (H, 4, 4), with their derivatives."""
-    parts = _parts(view, len(candidates), len(images) * samples)
+    parts = divided(view, len(candidates), len(images) * samples)
     if len(parts) > 1:
         passes = [linearize_distances(view.guess(k), candidates[k], images, samples) for k in parts]
         distances, *rest = zip(*passes, strict=True)
