@@ -198,7 +198,7 @@ def _of_machine(
     of the options. noise : of edges, corners and the tracker.
     """
     machine = subject if isinstance(subject, Machine) else load_mechanism(str(subject))
-    numbers = {}
+    numbers: dict[str, Any] = {}
     for option, value in readings.items():
         where = f"--{option.replace('_', '-')}"
         numbers[option] = in_joint_units(value, "m or rad", machine.joint_units, where)
