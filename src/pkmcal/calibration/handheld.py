@@ -541,7 +541,7 @@ def _by_neighbours(
     away = [np.linalg.norm(one.T_camera_base[:3, 3]) for one in so_far.placed.values()]
     lines = room.relative(p.station, so_far.placed, _OPTIONS.apart * float(np.median(away)))
     view = finest_view(scene.machine, p, session.joints, scene.T_base_platform, tables)
-    return localize_along(view, lines)
+    return localize_along(view, lines, legs.LEG_SEARCH_OPTIONS.sigma)
 
 
 def _legs(

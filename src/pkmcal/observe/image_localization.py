@@ -307,12 +307,13 @@ def _likeliest(poses: Array, likelihood: Array, count: int, keep: int) -> tuple[
 def localize_along(
     view: StationView,
     T_camera_base: Array,
+    scatter: float,
     options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
 ) -> Array:
-    """Likeliest pose on each of N lines of poses (N, D, 4, 4), such as a camera's at unknown
+    """Likeliest pose near each of N lines of poses (N, D, 4, 4), such as a camera's at unknown
     distance in a given direction; equal ones once, (n, 4, 4).
 
-    view : with the finest tables.
+    view : with the finest tables. scatter : as of :func:`refine_local`.
     """
     one, count, poses = np.zeros(1, dtype=int), len(T_camera_base), T_camera_base.reshape(-1, 4, 4)
     if not count:
@@ -321,7 +322,7 @@ def localize_along(
     starts, likelihood = refine_ml(view, starts, one, 8, 6)
     starts, likelihood = _likeliest(starts, likelihood, count, 1)
     starts = starts[np.argsort(-likelihood, kind="stable")]
-    return starts[distinct_silhouettes(view, starts, one)]
+    return refine_local(view, starts[distinct_silhouettes(view, starts, one)], scatter)[0]
 
 
 def localize_near(
