@@ -135,6 +135,18 @@ def test_a_leg_parallel_to_an_axis_that_counts_for_nothing(tmp_path):
     assert all(np.isfinite(part).all() for part in rows)
 
 
+def test_rods_of_a_leg_across_the_direction_that_counts_for_nothing(tmp_path):
+    """The platform joint's axes meet; its direction stands for any, and the leg is across it."""
+    nominal = load_mechanism(hexapod(tmp_path, 0.01, None))
+    layout, theta = nominal.layout.offsets, nominal.values.copy()
+    theta[layout.axis[:, 0]] = [0.0, 0.0, 1.0]
+    line = np.tile([0.2, -0.2, 0.0], (6, 1))
+    shifts = rod_shifts(layout, theta, np.eye(3), line)
+    assert all(np.isfinite(part).all() for part in shifts)
+    np.testing.assert_allclose(shifts.value[:, 0], 0.01 * line / np.hypot(0.2, 0.2), atol=1e-15)
+    assert not shifts.value[:, 1].any()
+
+
 def test_deviations_stated_from_images_hold(tmp_path):
     """Twelve calibrations by the edges of machines with errors of their prior sigmas."""
     camera = Pinhole((1280, 960), np.array([900.0, 900.0, 639.5, 479.5, 0, 0, 0, 0, 0]))

@@ -295,8 +295,11 @@ def rod_shifts(layout: OffsetLayout, theta: Array, rot: Array, line: Array) -> R
     """
     offset_a, offset_b = layout.offset[:, :1], layout.offset[:, 1:]
     v, w, v_size, own_size, n, n_platform, _ = _offset_state(layout, theta, rot, line)
-    by_vector, by_v = _direction_by(line + offset_b * n_platform, v, n)
-    by_other, by_w = _direction_by(offset_a * n - line, w, n_platform)
+    # a joint whose axes meet has a direction that nothing depends on, at any angle to the vector
+    at_base = np.where(offset_a != 0, line + offset_b * n_platform, n)
+    at_platform = np.where(offset_b != 0, offset_a * n - line, n_platform)
+    by_vector, by_v = _direction_by(at_base, v, n)
+    by_other, by_w = _direction_by(at_platform, w, n_platform)
     # columns: line, v, w
     unit, none = np.broadcast_to(np.eye(3), by_v.shape), np.zeros_like(by_v)
     system = np.block(
