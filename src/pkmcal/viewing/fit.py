@@ -11,11 +11,18 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
 from pkmcal.levels import OUTLIER_SIGMAS
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.image_localization import localize_image, localize_near, with_neighbours
+from pkmcal.observe.image_localization import (
+    localize_image,
+    localize_near,
+    log_prior_by_hand,
+    symmetric_poses,
+    with_neighbours,
+)
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, LocalizedPose, find_station
 from pkmcal.viewing.content import SessionContent
+from pkmcal.viewing.gestures import HAND_POSE_SIGMA
 from pkmcal.viewing.overlay import (
     overlay_after_gesture,
     pane_of,
@@ -35,6 +42,8 @@ FEWEST_FITTED_TOGETHER = 2
 """Fewest images of which some can verify the pose that the others give."""
 MOST_PLACES = 5
 """Poses between which a person can choose."""
+DISTINCT_DEGREES = 1.0
+"""Rotation, degrees, from which two poses are told apart in words: a text has no decimals."""
 LEAST_CHANCE_DISPLAYED = 1e-9
 """Probability below which no digits are displayed."""
 
@@ -147,8 +156,8 @@ def _from_images(view: StationView, start: Array | None, joints: _PlacedJoints) 
 def _from_one_image(view: StationView, start: Array | None, joints: _PlacedJoints) -> _Judgement:
     """Localization from the only image of a station, everywhere and near a start.
 
-    The start is no evidence: a person may take one leg of a machine of equal parts for another. The
-    joints that a person placed are.
+    A start is as likely as its symmetric poses: a person may take one leg of a machine of equal
+    parts for another. Joints that a person placed decide between them.
     """
     content, s = joints.content, joints.request.station
     image = content.image(s, joints.request.image)
@@ -157,19 +166,36 @@ def _from_one_image(view: StationView, start: Array | None, joints: _PlacedJoint
         content.poses_anywhere[s] = localize_image(view, image).T_camera_base
     poses = content.poses_anywhere[s]
     if start is not None:
-        poses = np.concatenate([localize_near(view, image, start).T_camera_base, poses])
-    hypotheses = with_neighbours(view, image, poses)
-    by_hand = np.array([joints.log_likelihood(T) for T in hypotheses.T_camera_base])
-    hypotheses = hypotheses.weighed(by_hand)
-    pose = LocalizedPose.of_image(hypotheses, has_prior=start is not None)
-    probability, rivals = brief(pose.p_value), hypotheses.T_camera_base[1:]
-    moved = joints.contradiction(pose.T_camera_base)
+        near = [localize_near(view, image, T) for T in (start, *symmetric_poses(view, start[None]))]
+        poses = np.concatenate([*(one.T_camera_base for one in near), poses])
+
+    def log_prior(poses: Array) -> Array:
+        by_hand = np.array([joints.log_likelihood(T) for T in poses])
+        if start is None:
+            return by_hand
+        return by_hand + log_prior_by_hand(view, start, poses, HAND_POSE_SIGMA)
+
+    hypotheses = with_neighbours(view, image, poses, log_prior)
+    # poses that a search near the first one reaches are told apart by further images
+    first, reach = hypotheses.T_camera_base[0], LOCALIZATION_OPTIONS.near
+    beside = np.array([reach.reaches(first, T) for T in hypotheses.T_camera_base])
+    rivals = hypotheses.select(np.flatnonzero(~beside | (np.arange(len(beside)) == 0)))
+    pose = LocalizedPose.of_image(rivals, has_prior=start is not None)
+    equals = hypotheses.select(beside & (hypotheses.probabilities > LOCALIZATION_OPTIONS.rival))
+    within = float(np.degrees(angle_between(equals.T_camera_base, first).max(initial=0.0)))
+    probability = brief(pose.p_value)
+    moved = joints.contradiction(first)
     if pose.good and moved:
         text = _contradicted(moved)
-    elif pose.good:
+    elif pose.good and within < DISTINCT_DEGREES:
         text = "Placed: from no other place does the machine fit as well."
-    elif len(rivals):
-        turn = np.degrees(angle_between(rivals[0], pose.T_camera_base))
+    elif pose.good:
+        text = (
+            "Placed: from no other place does the machine fit as well. Poses up to"
+            f" {within:.0f}° from this one fit nearly as well; further images tell them apart."
+        )
+    elif len(rivals.T_camera_base) > 1:
+        turn = np.degrees(angle_between(rivals.T_camera_base[1], first))
         text = (
             "Not placed: from several places the machine fits this image nearly as well. The second"
             f" best, turned by {turn:.0f}° against the best, is the right one with probability"
@@ -181,7 +207,7 @@ def _from_one_image(view: StationView, start: Array | None, joints: _PlacedJoint
             "Not placed: the best fit may be by chance, with probability"
             f" {probability}. Bring it to where it is, joint by joint."
         )
-    return _Judgement(hypotheses.T_camera_base, pose.good and not moved, text)
+    return _Judgement(rivals.T_camera_base, pose.good and not moved, text)
 
 
 def _contradicted(moved: float) -> str:

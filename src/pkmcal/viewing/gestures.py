@@ -17,12 +17,9 @@ from pkmcal.geometry.rigid import apply, pose, rotation
 
 PINNED_JOINT_SIGMA = 2.0
 """Standard deviation of a joint placed by hand, px."""
-HAND_POSE_SPREAD = np.array([*np.full(3, np.radians(6.0)), 0.1, *np.full(2, np.radians(6.0))])
-"""Prior sigmas of the hand-set pose that three or more pinned joints adjust.
-
-Aim and roll (rad), relative distance, turns (rad). They only decide what the joints leave
-undetermined.
-"""
+HAND_POSE_SIGMA = np.radians(6.0)
+"""Standard deviation of a pose set by hand: of aim, roll and turns, rad, and of the distance,
+relative. A rough pose is asked for within 10 degrees, the norm over three axes."""
 PINNING_ROUNDS = 4
 """Repetitions in which the result replaces the hand-set pose as the mean of the prior.
 
@@ -90,7 +87,6 @@ def pinned(
     from scipy.optimize import least_squares
 
     freedoms = 4 if len(pins) == 2 else 6
-    spread = HAND_POSE_SPREAD[:freedoms]
 
     # two joints fix aim, roll and distance exactly; more are fitted together with the prior
     def misfit(shifted: Callable[[Array], Array]) -> Callable[[Array], Array]:
@@ -100,7 +96,7 @@ def pinned(
         """
 
         def rows(x: Array) -> Array:
-            visible = camera.project(apply(shifted(x * spread), pins))
+            visible = camera.project(apply(shifted(x * HAND_POSE_SIGMA), pins))
             off = (
                 np.nan_to_num(visible - pixels, nan=UNSEEN_JOINT_PIXELS).ravel()
                 / PINNED_JOINT_SIGMA
@@ -113,7 +109,7 @@ def pinned(
         shifted = _motion(T_camera_base, points)
         with np.errstate(over="ignore"):  # a pixel may be kilometres away
             x = least_squares(misfit(shifted), np.zeros(freedoms)).x
-        T_camera_base = shifted(x * spread)
+        T_camera_base = shifted(x * HAND_POSE_SIGMA)
     return T_camera_base
 
 
