@@ -8,6 +8,7 @@ middle. The four gestures together cover the six degrees of freedom of a pose.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import combinations
 
 import numpy as np
 
@@ -25,6 +26,9 @@ PINNING_ROUNDS = 4
 
 The prior then affects only what the joints leave undetermined.
 """
+LEAST_DEPTH = 0.05
+"""Third coordinate of a unit ray below which a ray, 87 degrees off the axis, has no usable point in
+the plane before the camera."""
 UNSEEN_JOINT_PIXELS = 1e3
 """Residual, px, of a joint that does not project into the image."""
 
@@ -111,6 +115,29 @@ def pinned(
             x = least_squares(misfit(shifted), np.zeros(freedoms)).x
         T_camera_base = shifted(x * HAND_POSE_SIGMA)
     return T_camera_base
+
+
+def triangle_poses(camera: Camera, pins: Array, pixels: Array) -> Array:
+    """Poses (n, 4, 4), up to four, that bring three joints exactly to their pixels: those of n
+    joints that span the largest triangle in the image. None for fewer than three joints.
+
+    pins : (n, 3), base frame, m. pixels : (n, 2).
+    """
+    import cv2
+
+    rays = camera.ray(pixels)
+    triples = [
+        list(k) for k in combinations(range(len(pins)), 3) if (rays[list(k), 2] > LEAST_DEPTH).all()
+    ]
+    if not triples:
+        return np.empty((0, 4, 4))
+    plane = rays[..., :2] / rays[..., 2:]
+    widest = max(triples, key=lambda k: abs(np.linalg.det(plane[k[1:]] - plane[k[0]])))
+    _, turns, shifts = cv2.solveP3P(
+        pins[widest], plane[widest], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P
+    )
+    turn, shift = (np.array(part, dtype=float).reshape(-1, 3) for part in (turns, shifts))
+    return pose(rotation(turn), shift)
 
 
 def _motion(T_camera_base: Array, points: Array) -> Callable[[Array], Array]:
