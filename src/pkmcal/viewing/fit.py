@@ -195,7 +195,7 @@ def _from_one_image(view: StationView, joints: _PlacedJoints) -> _Judgement:
     nats = hypotheses.log_likelihood_ratio / hypotheses.unit - pin_evidence(
         hypotheses.T_camera_base
     )
-    overruled = nats.max() - nats[0] > HYPOTHESIS_THRESHOLDS.report
+    overruled = nats[~beside].max(initial=-np.inf) - nats[0] > HYPOTHESIS_THRESHOLDS.report
     probability = brief(pose.p_value)
     moved = joints.contradiction(first)
     if pose.good and moved:
