@@ -74,9 +74,9 @@ def answer(run: Callable[[], Any], wrong: Callable[[Any], bool]) -> tuple[Answer
 
     try:
         result = run()
+        codes = tuple(f.code for f in result.findings if f.level != "note")
     except PkmcalError as error:
         return Answer("refused", (f"{type(error).__name__}: {error}",)), None
-    codes = tuple(f.code for f in result.findings if f.level != "note")
     if result.exit_code:
         return Answer("refused", codes), result
     return Answer("wrong" if wrong(result) else "works", codes), result
