@@ -106,13 +106,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     # first: from afar, a search with soft readings follows a curved valley.
     measurements = replace(measurements, links=())
     near = hold(machine, measurements, start).located(start)
-    softer = [noise for noise in SOFT_READING_NOISES if noise > measurements.joint_noise]
-    for soft in softer or [measurements.joint_noise]:
-        held = hold(machine, replace(measurements, joint_noise=soft), near)
-        if held.stop is Stop.CONVERGED:
-            break
-    else:
-        raise not_converged(held.stop)
+    soft, held = _softly_held(machine, measurements, near)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])
@@ -160,6 +154,15 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
         noise=noise,
         by_machine=(units @ picks @ by).reshape(n * m, -1),
     )
+
+
+def _softly_held(machine: Machine, measurements: Measurements, near: State) -> tuple[float, Held]:
+    """The largest of SOFT_READING_NOISES with which the search ends, and its fit."""
+    for soft in (max(noise, measurements.joint_noise) for noise in SOFT_READING_NOISES):
+        held = hold(machine, replace(measurements, joint_noise=soft), near)
+        if held.stop is Stop.CONVERGED:
+            return soft, held
+    raise not_converged(Stop.STEPS)
 
 
 def _reading_selector(held: Held, n_rows: int) -> Array:
