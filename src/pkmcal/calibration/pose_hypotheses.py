@@ -424,21 +424,21 @@ def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
             own = np.flatnonzero((poses.station == s) & (poses.mount == m))
             at = poses.configuration[own]
             if machine.layout.underdetermined and determines_legs(poses.select(own)):
-                laid = register_by_lengths(
+                each = register_by_lengths(
                     machine, joints[group][:, at], observed[:, own], poses.whiten[own],
                     cases[0].joint_noise,
                 ).squares  # fmt: skip
             else:
-                laid = _laid(
+                each = _registered_squares(
                     body[group][:, at], observed[:, own], poses.whiten[own], size_of(machine)
                 )
-            squares.append(laid)
+            squares.append(each)
         if squares:
             out[group] = _usual(np.concatenate(squares, axis=1))
     return out
 
 
-def _laid(body: Array, observed: Array, whiten: Array, size: float) -> Array:
+def _registered_squares(body: Array, observed: Array, whiten: Array, size: float) -> Array:
     """Mean squares (N, n) of the whitened residuals of N runs of n poses of one station and mount.
 
     The closed form with the smallest residuals is where least squares start: a nominal error of the

@@ -205,8 +205,8 @@ def _turns(body: Array, observed: Array) -> list[tuple[Array, Array]]:
     right[..., 1:, 1:] -= 2 * skew((q_body @ conjugate)[..., 1:])
     each = _left_product(q_measured) @ right @ conjugate
     u, _, vt = np.linalg.svd(np.sum(sign[..., None, None] * each, axis=1))
-    laid = quaternion(register(body[..., :3, 3], observed[..., :3, 3])[..., :3, :3])
-    along = u.mT @ laid[..., None]
+    aligned = quaternion(register(body[..., :3, 3], observed[..., :3, 3])[..., :3, :3])
+    along = u.mT @ aligned[..., None]
     out: list[tuple[Array, Array]] = []
     for rank in HAND_EYE_RANKS:
         coefficients = along * (np.arange(4) < rank)[:, None]
