@@ -10,7 +10,7 @@ import pytest
 
 from faults import raises
 from pkmcal.boards.board import chessboard, load_board
-from pkmcal.boards.circles import circle_centres, find_circles
+from pkmcal.boards.circles import circle_centres
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.find import (
     Markers,
@@ -399,7 +399,9 @@ def test_a_circles_centre_is_not_its_images_centroid(tmp_path):
     T_camera_board = view(board, (0.0, 0.9, 0.0), (0.0, 0.0), 0.42)
     image = render(CAMERAS["pinhole"], T_camera_board, board)
     truth = CAMERAS["pinhole"].project(apply(T_camera_board, board.points))
-    rough = find_circles(image, board)
+    found, rough = cv2.findCirclesGrid(image, board.counts)
+    assert found
+    rough = rough.reshape(-1, 2)
     centres, good, _ = circle_centres(image, board, rough)
     assert good.all()
     assert np.sqrt(np.mean((rough - truth) ** 2)) > 0.1
@@ -613,18 +615,48 @@ def test_a_marker_with_two_dark_bits():
     assert len(marker_outlines(image)) > 0
 
 
-@pytest.mark.parametrize("pitch", [20, 60])
-def test_windows_are_no_circles(tmp_path, pitch):
-    """Sharp dark squares on the places of circles."""
+def windows(pitch, sides=(1.0, 1.0)):
+    """Image of 8 x 6 sharp dark rectangles, of half the pitch times ``sides``, x and y."""
     image = np.full((480, 640), 200, np.uint8)
+    half = np.rint(0.28 * pitch * np.array(sides)).astype(int)
     for row, column in np.ndindex(6, 8):
         y, x = 60 + pitch * row, 80 + pitch * column
-        half = round(0.28 * pitch)
-        image[y - half : y + half, x - half : x + half] = 40
+        image[y - half[1] : y + half[1], x - half[0] : x + half[0]] = 40
+    return image
+
+
+@pytest.mark.parametrize(
+    ("pitch", "sides", "blur"),
+    [
+        (20, (1.0, 1.0), 0.0),
+        (60, (1.0, 1.0), 0.0),
+        # as a circle, a blurred square and a rectangle have little of the fourth harmonic
+        (12, (1.0, 1.0), 1.2),
+        (60, (1.2, 0.8), 0.0),
+    ],
+)
+def test_windows_are_no_circles(tmp_path, pitch, sides, blur):
+    """Dark rectangles on the places of circles."""
+    image = windows(pitch, sides)
+    image = cv2.GaussianBlur(image, (0, 0), blur) if blur else image
     cv2.imwrite(str(tmp_path / "windows.png"), image)
     with pytest.raises(InputError) as caught:
         detect_boards([tmp_path / "windows.png"], board_of(tmp_path, FILES["circle_grid"]))
     assert caught.value.found == "only 0 of 48 corners are sharp and uncovered"
+
+
+def test_windows_beside_a_board_do_not_hide_it(tmp_path):
+    """OpenCV's detector finds the dark windows first, light circles last."""
+    board = board_of(tmp_path, FILES["circle_grid"])
+    image = np.full((480, 640), 200, np.uint8)
+    image[:240, :320] = cv2.resize(windows(60), (320, 240), interpolation=cv2.INTER_AREA)
+    image[240:, 320:] = 30
+    truth = np.array([(350 + 35 * c, 265 + 35 * r) for r, c in np.ndindex(6, 8)])
+    for x, y in truth.tolist():
+        cv2.circle(image, (x, y), 11, 220, -1, cv2.LINE_AA)
+    detection = detect_board(cv2.GaussianBlur(image, (0, 0), 0.8), board)
+    np.testing.assert_array_equal(detection.ids, np.arange(48))
+    np.testing.assert_allclose(detection.pixels, truth, atol=0.02)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5000), (5000, 1), (2, 3000), (20, 20)])

@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import pi
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board
-from pkmcal.levels import CONTRADICTION_SIGMAS
+from pkmcal.levels import CONTRADICTION_SIGMAS, MAJORITY
 from pkmcal.observe.images import narrowed
 
 LEAST_WINDOW_RADIUS = 2.5
@@ -43,35 +43,54 @@ class CircleOptions:
     ring: float = 0.85
     # least difference between circle and paper, in standard deviations of the paper
     least_contrast: float = CONTRADICTION_SIGMAS
-    # largest median over a grid of the fourth harmonic of an outline, weighted by the fourth power
-    # of the radius: the middle between a circle's, 0, and a square's, 3/7 (derived). Blur rounds
-    # squares: half of their grids of 10 and 14 px pitch pass for circles (measured)
-    most_angular: float = 3 / 14
+    # largest fourth cumulant of a grid's outlines, the median: the middle between that of circles,
+    # 0, and that of squares, 1 / 60, the least of rectangles (derived)
+    most_angular: float = 1 / 120
+    # share of a grid's circles that must be reliable; with less, another grid is tried
+    whole_share: float = MAJORITY
 
 
 CIRCLE_OPTIONS = CircleOptions()
 
 
+class Circles(NamedTuple):
+    """Centres (N, 2) px in the board's order, whether each is reliable (N,), and sigma (N,) px."""
+
+    pixels: Array
+    good: Booleans
+    sigma: Array
+
+
 def find_circles(
     image: Integers, board: Board, options: CircleOptions = CIRCLE_OPTIONS
-) -> Array | None:
-    """Rough centres (N, 2) px in the board's order; None if the grid is not detected."""
+) -> Circles | None:
+    """The board's circles; None if the grid is not detected.
+
+    OpenCV's detector may find the counts of circles at wrong places first, such as partly beside
+    the board. Among its grids, the one with the most reliable circles is taken.
+    """
     columns, rows = board.counts
-    image, scale = narrowed(image, options.searched_width)
-    for centres in _attempts(image, board, options):
+    searched, scale = narrowed(image, options.searched_width)
+    best: Circles | None = None
+    for centres in _attempts(searched, board, options):
         grid = ((centres + 0.5) / scale - 0.5).reshape(rows, columns, 2)
         right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-        if right[0] * down[1] - right[1] * down[0] > 0:
-            return grid.reshape(-1, 2)
-        if not board.document.get("asymmetric", False):
-            return grid[:, ::-1].reshape(-1, 2)
-    return None
+        if right[0] * down[1] - right[1] * down[0] <= 0:
+            if board.document.get("asymmetric", False):
+                continue
+            grid = grid[:, ::-1]
+        measured = circle_centres(image, board, grid.reshape(-1, 2), options)
+        if best is None or measured.good.sum() > best.good.sum():
+            best = measured
+        if best.good.mean() >= options.whole_share:
+            break
+    return best
 
 
 def circle_centres(
     image: Integers, board: Board, start: Array, options: CircleOptions = CIRCLE_OPTIONS
-) -> tuple[Array, Booleans, Array]:
-    """Centres (N, 2) px from rough ones, whether each is reliable (N,), and sigma (N,) px."""
+) -> Circles:
+    """The circles near rough centres (N, 2) px; none is reliable if they are not circles."""
     xy = board.points[:, :2]
     gap = np.linalg.norm(xy[:, None] - xy, axis=-1)
     order = np.argsort(gap, axis=1, kind="stable")[:, : options.neighbours]
@@ -79,7 +98,7 @@ def circle_centres(
     centres = start.astype(float)
     grey = image.astype(np.float32)
     good, sigma = np.zeros(len(xy), dtype=bool), np.zeros(len(xy))
-    angular: list[float] = []
+    cumulants: list[complex] = []
     for _ in range(options.passes):
         measured = [
             _centre(grey, xy[i], _homography(xy[near], centres[near]), half, options)
@@ -90,11 +109,12 @@ def circle_centres(
             [old if one is None else one[0] for old, one in zip(centres, measured, strict=True)]
         )
         sigma = np.array([0.0 if one is None else one[1] for one in measured])
-        angular = [one[2] for one in measured if one is not None]
-    # the corners of windows, keys or tiles
-    if good.any() and np.median(angular) > options.most_angular:
-        good[:] = False
-    return centres, good, sigma
+        cumulants = [one[2] for one in measured if one is not None]
+    # windows, keys or tiles, which all have one orientation on the board
+    if cumulants:
+        middle = np.median(np.real(cumulants)) + 1j * np.median(np.imag(cumulants))
+        good &= abs(middle) <= options.most_angular
+    return Circles(centres, good, sigma)
 
 
 def _attempts(image: Integers, board: Board, options: CircleOptions) -> Iterator[Array]:
@@ -112,11 +132,15 @@ def _attempts(image: Integers, board: Board, options: CircleOptions) -> Iterator
     if settings.maxArea < settings.minArea:
         return  # the image has no room for the grid
     settings.minDistBetweenBlobs = float(np.sqrt(options.least_area))
-    blobs: Any = cv2.SimpleBlobDetector.create(settings)
+    detector: Any = cv2.SimpleBlobDetector.create(settings)
+    no_detector: Any = None  # then the first argument is the places of blobs
     for picture in (image, 255 - image):
+        blobs = np.array([blob.pt for blob in detector.detect(picture)], dtype=np.float32)
+        if len(blobs) < options.whole_share * len(board.points):
+            continue
         for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
             success, centres = cv2.findCirclesGrid(
-                picture, board.counts, flags=flags, blobDetector=blobs
+                blobs[:, None], board.counts, flags, no_detector, cv2.CirclesGridFinderParameters()
             )
             if success and centres is not None:
                 yield np.asarray(centres, dtype=float).reshape(-1, 2)
@@ -132,12 +156,16 @@ def _homography(xy: Array, pixels: Array) -> Array:
 
 def _centre(
     image: Array, xy: Array, H: Array, half: float, options: CircleOptions
-) -> tuple[Array, float, float] | None:
-    """Centre (2,) px, its standard deviation, and the fourth harmonic of the outline; None where
-    nothing stands out.
+) -> tuple[Array, float, complex] | None:
+    """Centre (2,) px, its standard deviation, and fourth cumulant; None where nothing stands out.
 
     image : grey levels, float32. xy : (2,) m, place on the board. half : half the distance to the
         nearest circle, m.
+
+    The fourth cumulant is that of z = x + i y, from the centroid of an outline of the area A, in
+    units of A^2: the mean of z^4 less three times the square of that of z^2. A Gaussian blur, whose
+    own is zero, does not change it, be it isotropic on the board or not. It is 0 for a circle and
+    -(t^2 + 1 / t^2) / 120 for a rectangle with the ratio t of its sides, along these.
     """
     import cv2
 
@@ -158,14 +186,16 @@ def _centre(
         return None
     share = np.where(radius <= 1, (level - grey) / contrast, 0.0)
     total = float(share.sum())
-    quartic = ((offsets[..., 0] + 1j * offsets[..., 1]) / half) ** 4
-    angular = abs(np.sum(share * quartic)) / abs(np.sum(share * abs(quartic)))
     offset = np.sum(share[..., None] * offsets, axis=(0, 1)) / total
+    place = (offsets - offset) @ [1, 1j]
+    area = total * (axis[1] - axis[0]) ** 2
+    second, fourth = (np.sum(share * place**n) / total for n in (2, 4))
+    cumulant = complex((fourth - 3 * second**2) / area**2)
     # White noise of the pixels; their number in a sample cancels.
     spread = float(np.sum(offsets[radius <= 1][:, 0] ** 2))
     sigma = noise / abs(contrast) * np.sqrt(spread) / total / (axis[1] - axis[0])
     centre = _projected(H, xy + offset)
-    return centre, float(max(sigma, 1e-4)), float(angular)
+    return centre, float(max(sigma, 1e-4)), cumulant
 
 
 def _projected(H: Array, xy: Array) -> Array:
