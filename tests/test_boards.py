@@ -19,6 +19,7 @@ from pkmcal.boards.find import (
     dictionary,
     marker_outlines,
 )
+from pkmcal.boards.lattice import lattices
 from pkmcal.boards.layout import another_grid, marker_layout
 from pkmcal.boards.prints import Print
 from pkmcal.boards.saddles import SaddleOptions, largest_block, saddles
@@ -730,3 +731,68 @@ def test_points_stand_where_opencv_has_them(tmp_path):
     words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     theirs = cv2.aruco.GridBoard((5, 4), 0.04, 0.012, words).getObjPoints()
     np.testing.assert_allclose(grid.points, np.asarray(theirs).reshape(-1, 3), atol=1e-7)
+
+
+def discs(columns, rows, without=(), pitch=34, shift=0):
+    """Image of dark discs in rows, every second one shifted; places (rows, columns, 2) px."""
+    image = np.full((pitch * (rows + 3), pitch * (columns + 4)), 210, np.uint8)
+    row, column = np.mgrid[:rows, :columns]
+    places = np.stack([pitch * (column + 2) + shift * (row % 2), pitch * (row + 2)], axis=-1)
+    for at in np.ndindex(rows, columns):
+        if at not in without:
+            cv2.circle(image, tuple(places[at].tolist()), 10, 40, -1, cv2.LINE_AA)
+    turn = cv2.getRotationMatrix2D((image.shape[1] / 2, image.shape[0] / 2), 7.0, 0.9)
+    image = cv2.warpAffine(image, turn, image.shape[::-1], borderValue=210)
+    return cv2.GaussianBlur(image, (0, 0), 0.8), places @ turn[:, :2].T + turn[:, 2]
+
+
+@pytest.mark.parametrize(
+    ("described", "shift"),
+    [
+        ("type: chessboard\ncorners: [8, 5]\nsquare: 0.03\n", 0),
+        ("type: circle_grid\ncircles: [7, 6]\nspacing: 0.02\n", 0),
+        (FILES["circle_grid_asymmetric"], 17),
+    ],
+)
+def test_discs_everywhere_are_no_board(tmp_path, described, shift):
+    """A grid of circles has only its counts: a part of a larger one is none."""
+    cv2.imwrite(str(tmp_path / "discs.png"), discs(20, 14, shift=shift)[0])
+    with pytest.raises(InputError) as caught:
+        detect_boards([tmp_path / "discs.png"], board_of(tmp_path, described))
+    assert caught.value.code == "board.not_found"
+
+
+def test_a_grid_of_other_counts(tmp_path):
+    cv2.imwrite(str(tmp_path / "discs.png"), discs(8, 6)[0])
+    board = board_of(tmp_path, "type: circle_grid\ncircles: [7, 6]\nspacing: 0.02\n")
+    with raises(InputError, code="board.not_found", found="a lattice of 8x6 circles"):
+        detect_boards([tmp_path / "discs.png"], board)
+
+
+def test_circles_that_are_covered(tmp_path):
+    """Single circles may be; of a grid without its first column, nobody knows which column is."""
+    board = board_of(tmp_path, "type: circle_grid\ncircles: [7, 6]\nspacing: 0.02\n")
+    image, places = discs(7, 6, {(0, 0), (2, 3), (5, 6)})
+    detection = detect_board(image, board)
+    assert set(range(42)) - set(detection.ids.tolist()) == {0, 17, 41}
+    np.testing.assert_allclose(detection.pixels, places.reshape(-1, 2)[detection.ids], atol=0.05)
+    assert not detect_board(discs(6, 6)[0], board).success
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1.1])
+def test_lattices_keep_their_steps(tilt):
+    """Points of a plane at a large tilt, shuffled, with others beside them."""
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[:9, :7].reshape(2, -1)
+    x, y = column - 3.0, (row - 4.0) * np.cos(tilt)
+    grid = np.stack([x, y], axis=-1) * 500 / (14 + (row - 4.0) * np.sin(tilt))[:, None]
+    beside = rng.uniform((150, -200), (300, 200), (40, 2))
+    order = rng.permutation(len(grid) + len(beside))
+    first, *_ = lattices(np.concatenate([grid, beside])[order])
+    mine = order[first.points] < len(grid)
+    assert mine.sum() == len(grid)
+    cells, number = first.cells[mine], order[first.points[mine]]
+    true = np.stack([column, row], axis=-1)[number]
+    steps = np.linalg.lstsq(true - true.mean(axis=0), cells - cells.mean(axis=0), rcond=None)[0]
+    np.testing.assert_allclose(np.abs(np.linalg.det(steps)), 1.0, atol=1e-9)
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from math import pi
 from typing import Any, NamedTuple
 
@@ -17,9 +18,17 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board
+from pkmcal.boards.lattice import Lattice, lattices
 from pkmcal.levels import CONTRADICTION_SIGMAS, MAJORITY
 from pkmcal.observe.images import narrowed
 
+BASES: Integers = np.array([
+    (a, b, c, d) for a, b, c, d in product((-1, 0, 1), repeat=4) if a * d - b * c == 1
+]).reshape(-1, 2, 2)  # fmt: skip
+"""Changes from one basis of a lattice to others of the same sense: the two shortest steps in an
+image may be others than on the board."""
+DIAGONALS: Integers = np.array([(1, 1), (-1, 1)])
+"""Steps of an asymmetric grid's lattice along the board's axes, in spacings."""
 LEAST_WINDOW_RADIUS = 2.5
 """Smallest radius, px, of what is measured on a board: a smaller window holds too few pixels for
 the seven unknowns of a corner."""
@@ -63,28 +72,30 @@ class Circles(NamedTuple):
 
 def find_circles(
     image: Integers, board: Board, options: CircleOptions = CIRCLE_OPTIONS
-) -> Circles | None:
-    """The board's circles; None if the grid is not detected.
+) -> tuple[Circles | None, str]:
+    """The board's circles, None if they are not detected; and what was found instead.
 
-    OpenCV's detector may find the counts of circles at wrong places first, such as partly beside
-    the board. Among its grids, the one with the most reliable circles is taken.
+    A grid of circles has no mark of its own but its counts. A lattice that goes on beyond them, or
+    of which a border is missing, is not the board.
     """
-    columns, rows = board.counts
     searched, scale = narrowed(image, options.searched_width)
     best: Circles | None = None
-    for centres in _attempts(searched, board, options):
-        grid = ((centres + 0.5) / scale - 0.5).reshape(rows, columns, 2)
-        right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-        if right[0] * down[1] - right[1] * down[0] <= 0:
-            if board.document.get("asymmetric", False):
+    why = f"no grid like {board.described}"
+    for blobs in _blobs(searched, board, options):
+        for lattice in lattices(blobs):
+            if len(lattice.points) < options.whole_share * len(board.points):
                 continue
-            grid = grid[:, ::-1]
-        measured = circle_centres(image, board, grid.reshape(-1, 2), options)
-        if best is None or measured.good.sum() > best.good.sum():
-            best = measured
-        if best.good.mean() >= options.whole_share:
-            break
-    return best
+            centres, (columns, rows) = _on_board(lattice, blobs, board)
+            if centres is None:
+                why = f"a lattice of {columns}x{rows} circles"
+                continue
+            start = (centres + 0.5) / scale - 0.5
+            measured = circle_centres(image, board, start, options)
+            if best is None or measured.good.sum() > best.good.sum():
+                best = measured
+            if best.good.mean() >= options.whole_share:
+                return best, ""
+    return best, why
 
 
 def circle_centres(
@@ -117,15 +128,10 @@ def circle_centres(
     return Circles(centres, good, sigma)
 
 
-def _attempts(image: Integers, board: Board, options: CircleOptions) -> Iterator[Array]:
-    """Centres (N, 2) by OpenCV's detector, of dark circles, then of light ones."""
+def _blobs(image: Integers, board: Board, options: CircleOptions) -> Iterator[Array]:
+    """Places (n, 2) px of dark blobs, then of light ones."""
     import cv2
 
-    kind = (
-        cv2.CALIB_CB_ASYMMETRIC_GRID
-        if board.document.get("asymmetric", False)
-        else cv2.CALIB_CB_SYMMETRIC_GRID
-    )
     settings: Any = cv2.SimpleBlobDetector.Params()
     settings.minArea = options.least_area
     settings.maxArea = image.size / len(board.points)
@@ -133,17 +139,63 @@ def _attempts(image: Integers, board: Board, options: CircleOptions) -> Iterator
         return  # the image has no room for the grid
     settings.minDistBetweenBlobs = float(np.sqrt(options.least_area))
     detector: Any = cv2.SimpleBlobDetector.create(settings)
-    no_detector: Any = None  # then the first argument is the places of blobs
     for picture in (image, 255 - image):
-        blobs = np.array([blob.pt for blob in detector.detect(picture)], dtype=np.float32)
-        if len(blobs) < options.whole_share * len(board.points):
-            continue
-        for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
-            success, centres = cv2.findCirclesGrid(
-                blobs[:, None], board.counts, flags, no_detector, cv2.CirclesGridFinderParameters()
-            )
-            if success and centres is not None:
-                yield np.asarray(centres, dtype=float).reshape(-1, 2)
+        yield np.array([blob.pt for blob in detector.detect(picture)]).reshape(-1, 2)
+
+
+def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | None, tuple[int, int]]:
+    """Centres (N, 2) px in the board's order, those without a blob by the homography of their
+    neighbours; None if the lattice is not the board's. And the lattice's columns and rows.
+    """
+    asymmetric = bool(board.document.get("asymmetric", False))
+    columns, rows = board.counts
+    row, column = np.mgrid[-1 : rows + 1, -1 : columns + 1].reshape(2, -1)
+    # the board's places and those around it, and which are its own
+    around = np.stack([2 * column + row % 2 if asymmetric else column, row], axis=-1)
+    own = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    fits = [
+        _placed(lattice.cells @ turn @ (DIAGONALS if asymmetric else np.eye(2, dtype=int)),
+                around[own], blobs[lattice.points])
+        for turn in BASES
+    ]  # fmt: skip
+    cells = max(fits, key=lambda fit: fit[:3])[3]
+    point_at = {tuple(cell): int(k) for cell, k in zip(cells.tolist(), lattice.points, strict=True)}
+    points = np.array([point_at.get(tuple(cell), -1) for cell in around.tolist()])
+    seen = (points >= 0).reshape(rows + 2, columns + 2)
+    border, beyond = (
+        np.concatenate([seen[[k, -1 - k], 1:-1].mean(axis=1), seen[1:-1, [k, -1 - k]].mean(axis=0)])
+        for k in (1, 0)
+    )
+    width, height = np.ptp(cells, axis=0) + 1
+    counts = int((width + 1) // 2 if asymmetric else width), int(height)
+    if border.min() <= MAJORITY or beyond.max() > MAJORITY:
+        return None, counts
+    xy, mine = board.points[:, :2], points[own]
+    known = mine >= 0
+    centres = np.where(known[:, None], blobs[mine], np.nan)
+    for k in np.flatnonzero(~known):
+        gap = np.linalg.norm(xy[known] - xy[k], axis=-1)
+        near = np.flatnonzero(known)[np.argsort(gap, kind="stable")[: CIRCLE_OPTIONS.neighbours]]
+        centres[k] = _projected(_homography(xy[near], centres[near]), xy[k])
+    return centres, counts
+
+
+def _placed(cells: Integers, board: Integers, places: Array) -> tuple[int, int, float, Integers]:
+    """Number of lattice points (n, 2) on the board's places (N, 2) after the best shift; the
+    negative area of their bounding box; cosine of the angle between the board's x axis and the
+    image's; and the shifted points.
+
+    places : (n, 2) px.
+    """
+    shifts = (cells[:, None] - board).reshape(-1, 2)
+    low, size = shifts.min(axis=0), np.ptp(shifts, axis=0) + 1
+    number = np.bincount((shifts - low) @ [size[1], 1])
+    shift = np.array(divmod(int(number.argmax()), int(size[1]))) + low
+    # mean step of the image along the two axes
+    axes = np.linalg.lstsq(cells - cells.mean(axis=0), places - places.mean(axis=0), rcond=None)[0]
+    rightward = float(axes[0, 0] / np.linalg.norm(axes[0]))
+    area = int(np.prod(np.ptp(cells, axis=0) + 1))
+    return int(number.max()), -area, rightward, cells - shift
 
 
 def _homography(xy: Array, pixels: Array) -> Array:

@@ -86,10 +86,12 @@ def detect_board(
     name: str = "",
     quick: bool = False,
     options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS,
+    block: int | None = None,
 ) -> Detection:
     """Find the board's corners in one image, grey levels (height, width) uint8.
 
-    quick : only the first way of finding a chessboard.
+    quick : only the first way of finding a chessboard. block : the image's `largest_block`, None if
+        it is not known yet.
     """
     mirrored, why = False, ""
     circles: Circles | None = None
@@ -99,10 +101,10 @@ def detect_board(
         raw, mirrored, why = _marker_grid(image, board, options)
     else:
         if board.type == "chessboard":
-            pixels = find_chessboard(image, board.counts, quick, options=options)
+            pixels = find_chessboard(image, board.counts, quick, block, options)
             why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners"
         else:
-            circles, why = find_circles(image, board), f"no grid like {board.described}"
+            circles, why = find_circles(image, board)
             pixels = None if circles is None else circles.pixels
         raw = NO_CORNERS if pixels is None else (np.arange(len(pixels)), pixels)
     size = (image.shape[1], image.shape[0])
