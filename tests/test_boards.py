@@ -511,6 +511,18 @@ def test_a_grid_of_kalibr_described_as_one_that_runs_to_the_right(tmp_path):
     assert "ids go on by -1 to the right and by +5 downward" in caught.value.found
 
 
+def test_a_border_of_another_width(tmp_path):
+    """Kalibr's tags, described as OpenCV prints them."""
+    board = board_of(tmp_path, FILES["kalibr_aprilgrid"])
+    image = render(CAMERAS["pinhole"], view(board, *VIEWS["kalibr_aprilgrid", "pinhole"]), board)
+    cv2.imwrite(str(tmp_path / "tags.png"), image)
+    other = board_of(tmp_path, yaml_text({**board.document, "border": 1}))
+    with pytest.raises(InputError) as caught:
+        detect_boards([tmp_path / "tags.png"], other)
+    assert caught.value.code == "board.another"
+    assert caught.value.found.endswith("of DICT_APRILTAG_36h11 with border: 2")
+
+
 def test_two_boards_mixed(pictures):
     """A minority of images with another board is not used, with the reason; a majority refused."""
     board, paths = pictures["charuco"]

@@ -353,6 +353,12 @@ def other_board(
         best = _other_charuco(image, board, detect_markers(image, dictionary(name)), options)
         if best:
             return best
+    if board.type == "aruco_grid":
+        # the same markers with a border of another width, as Kalibr's differ from OpenCV's
+        border = 3 - board.document.get("border", 1)
+        count = len(detect_markers(image, dictionary(name), border=border).ids)
+        if count >= options.least_markers:
+            return f"{count} markers of {name} with border: {border}"
     return _other_markers(image, name, options) or _other_chessboard(
         image, (0, 0), part=True, options=options
     )
