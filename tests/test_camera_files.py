@@ -644,8 +644,8 @@ def test_other_files_of_kalibr(tmp_path, text):
 def test_a_camera_of_kalibr_without_a_field(tmp_path, without):
     camera = camera_of("extended_unified")
     text = foreign_text(camera, tmp_path / "chain.yaml", "kalibr")
-    kept = re.sub(rf"^  {without}:.*?(?=^  \w|\Z)", "", text, flags=re.MULTILINE | re.DOTALL)
-    (tmp_path / "chain.yaml").write_text(kept)
+    rest = re.sub(rf"^  {without}:.*?(?=^  \w|\Z)", "", text, flags=re.MULTILINE | re.DOTALL)
+    (tmp_path / "chain.yaml").write_text(rest)
     with pytest.raises(InputError) as caught:
         load_camera(tmp_path / "chain.yaml")
     assert f"cam0.{without}" in str(caught.value.where)

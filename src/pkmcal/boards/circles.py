@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from math import pi
+from math import pi, prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -158,7 +158,8 @@ def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | Non
                 around[own], blobs[lattice.points])
         for turn in BASES
     ]  # fmt: skip
-    cells = max(fits, key=lambda fit: fit[:3])[3]
+    fits.sort(key=lambda fit: fit[:3], reverse=True)
+    cells = fits[0][3]
     point_at = {tuple(cell): int(k) for cell, k in zip(cells.tolist(), lattice.points, strict=True)}
     points = np.array([point_at.get(tuple(cell), -1) for cell in around.tolist()])
     seen = (points >= 0).reshape(rows + 2, columns + 2)
@@ -166,8 +167,12 @@ def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | Non
         np.concatenate([seen[[k, -1 - k], 1:-1].mean(axis=1), seen[1:-1, [k, -1 - k]].mean(axis=0)])
         for k in (1, 0)
     )
-    width, height = np.ptp(cells, axis=0) + 1
-    counts = int((width + 1) // 2 if asymmetric else width), int(height)
+    sizes = [np.ptp(fit[3], axis=0) + 1 for fit in fits]
+    # of a lattice that is not the board's, the counts with the fewest gaps
+    counts = min(
+        ((int((width + 1) // 2 if asymmetric else width), int(height)) for width, height in sizes),
+        key=prod,
+    )
     if border.min() <= MAJORITY or beyond.max() > MAJORITY:
         return None, counts
     xy, mine = board.points[:, :2], points[own]
