@@ -19,7 +19,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board
 from pkmcal.boards.lattice import Lattice, lattices
-from pkmcal.levels import CONTRADICTION_SIGMAS, MAJORITY
+from pkmcal.levels import CONTRADICTION_SIGMAS, FEW, MAJORITY
 from pkmcal.observe.images import narrowed
 
 BASES: Integers = np.array([
@@ -173,7 +173,8 @@ def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | Non
         ((int((width + 1) // 2 if asymmetric else width), int(height)) for width, height in sizes),
         key=prod,
     )
-    if border.min() <= MAJORITY or beyond.max() > MAJORITY:
+    # too few circles of an outer row or column do not tell it from a stray blob beside it
+    if border.min() < FEW or beyond.max() > MAJORITY or beyond.max() >= border.min():
         return None, counts
     xy, mine = board.points[:, :2], points[own]
     known = mine >= 0

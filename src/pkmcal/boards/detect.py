@@ -356,7 +356,9 @@ def other_board(
     if board.type == "aruco_grid":
         # the same markers with a border of another width, as Kalibr's differ from OpenCV's
         border = 3 - board.document.get("border", 1)
-        count = len(detect_markers(image, dictionary(name), border=border).ids)
+        own = dictionary(name, board.document.get("first_id", 0), board.counts[0] * board.counts[1])
+        small, _ = narrowed(image, options.detection.searched_width)
+        count = len(detect_markers(small, own, border=border).ids)
         if count >= options.least_markers:
             return f"{count} markers of {name} with border: {border}"
     return _other_markers(image, name, options) or _other_chessboard(

@@ -99,14 +99,22 @@ def _blocks(places: Array, tree: Any, options: LatticeOptions) -> tuple[Integers
 
 
 def _grown(
-    places: Array, tree: Any, free: Array, seed: int, first: Array, options: LatticeOptions
+    places: Array, tree: Any, free: Array, seed: int, start: Array, options: LatticeOptions
 ) -> Lattice:
     """The lattice of a point and its two steps (2, 2) px, grown wave by wave."""
     point_at = {(0, 0): seed}
-    cell_of, steps = {seed: (0, 0)}, {seed: first}
+    cell_of, steps = {seed: (0, 0)}, {seed: start}
     front: list[int] = [seed]
     while front:
         moves = np.stack([SIDES @ steps[k] for k in front])
+        # steps change as they did before, under perspective and distortion
+        for k, point in enumerate(front):
+            for side, (di, dj) in enumerate(SIDES.tolist()):
+                i, j = cell_of[point]
+                last, first = (point_at.get((i - n * di, j - n * dj)) for n in (1, 2))
+                if last is not None and first is not None:
+                    change = places[point] - 2 * places[last] + places[first]
+                    moves[k, side] = places[point] - places[last] + change
         miss, nearest = tree.query(places[front, None] + moves)
         reach = [options.reach * np.linalg.norm(steps[k], axis=-1).min() for k in front]
         hits = np.argwhere(miss < np.array(reach)[:, None])
