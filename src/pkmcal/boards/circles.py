@@ -190,15 +190,17 @@ def _described(turns: list[Integers], asymmetric: bool) -> str:
     asymmetric : the kind that is taken if both are equally good.
     """
     shapes = [
-        (*(np.ptp(cells @ DIAGONALS if kind else cells, axis=0) + 1).tolist(), kind)
+        (np.ptp(cells @ DIAGONALS if kind else cells, axis=0).tolist(), kind)
         for kind in (asymmetric, not asymmetric)
         for cells in turns
     ]
     # every second place of an asymmetric lattice is empty
-    width, height, kind = min(shapes, key=lambda shape: shape[0] * shape[1] / (1 + shape[2]))
-    if kind:
-        return f"an asymmetric lattice of {(width + 1) // 2}x{height} blobs"
-    return f"a lattice of {width}x{height} blobs"
+    counts = [
+        (width // 2 + 1 if kind else width + 1, height + 1, kind)
+        for (width, height), kind in shapes
+    ]
+    columns, rows, kind = min(counts, key=lambda one: one[0] * one[1])
+    return f"{'an asymmetric' if kind else 'a'} lattice of {columns}x{rows} blobs"
 
 
 def _placed(cells: Integers, board: Integers, places: Array) -> tuple[int, int, float, Integers]:
