@@ -774,10 +774,14 @@ def test_discs_everywhere_are_no_board(tmp_path, described, shift):
     assert caught.value.code == "board.not_found"
 
 
-def test_a_grid_of_other_counts(tmp_path):
-    cv2.imwrite(str(tmp_path / "discs.png"), discs(8, 6)[0])
+@pytest.mark.parametrize(
+    ("columns", "shift", "description"),
+    [(8, 0, "a lattice of 8x6 blobs"), (4, 17, "an asymmetric lattice of 4x6 blobs")],
+)
+def test_a_grid_of_other_counts(tmp_path, columns, shift, description):
+    cv2.imwrite(str(tmp_path / "discs.png"), discs(columns, 6, shift=shift)[0])
     board = board_of(tmp_path, "type: circle_grid\ncircles: [7, 6]\nspacing: 0.02\n")
-    with raises(InputError, code="board.not_found", found="a lattice of 8x6 circles"):
+    with raises(InputError, code="board.not_found", found=description):
         detect_boards([tmp_path / "discs.png"], board)
 
 

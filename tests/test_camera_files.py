@@ -504,6 +504,7 @@ def test_visp_cameras(tmp_path):
         ("</root>", "", None),
         ("<root>", "<!DOCTYPE a [<!ENTITY b 'c'>]>\n<root>", None),
         ("<px>1089.9</px>", "<px>nan</px>", None),
+        ("<px>1089.9</px>", "", None),
         ("<kud>-0.196</kud>", "", None),
         ("<image_width>640</image_width>", "", None),
         ("out", "Kannala", None),
@@ -657,3 +658,42 @@ def test_an_opencv_file_without_known_distortion(tmp_path):
     (tmp_path / "camera.yaml").write_text(text.replace("distortion_coefficients", "dist"))
     with raises(InputError, expected="distortion_coefficients"):
         load_camera(tmp_path / "camera.yaml")
+
+
+def test_a_camera_that_was_never_calibrated(tmp_path):
+    """ROS publishes zeros for it."""
+    with raises(InputError, where="c.yaml, line 4, camera_matrix"):
+        read_text(tmp_path, ROS.replace("500, 0, 320, 0, 501, 240, 0, 0, 1", "0, " * 8 + "0"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("rows: 5", "rows: 8", "distortion_coefficients"),
+        ("data: [ 0.1", "data: [ .Nan", "distortion_coefficients"),
+        ("data: [ 500.", "data: [ .Inf", "camera_matrix"),
+        ("data: [ 500., 0.", "data: [ 500., 1.", "camera_matrix"),
+    ],
+)
+def test_a_fault_in_a_matrix_of_opencv(tmp_path, old, new, field):
+    assert old in OPENCV
+    with raises(InputError, where=f"c.yaml, {field}"):
+        read_text(tmp_path, OPENCV.replace(old, new, 1))
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n1 1 0 0 0 1 2 3 1 a.jpg\n",
+         "'1 1 0 0 0 1 2 3 1 a.jpg'"),
+        ("#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n", None),
+    ],
+)  # fmt: skip
+def test_files_of_colmap_without_cameras(tmp_path, text, found):
+    with raises(InputError, found=found, where="c.yaml"):
+        read_text(tmp_path, text)
+
+
+def test_an_inertial_sensor_where_a_camera_is_named(tmp_path):
+    with raises(InputError, code="camera.other_file"):
+        read_text(tmp_path, "imu0:\n  gyroscope_noise_density: 1.87e-04\n", "cam0")

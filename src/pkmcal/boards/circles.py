@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from math import pi, prod
+from math import pi
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,9 +85,9 @@ def find_circles(
         for lattice in lattices(blobs):
             if len(lattice.points) < options.whole_share * len(board.points):
                 continue
-            centres, (columns, rows) = _on_board(lattice, blobs, board)
+            centres, description = _on_board(lattice, blobs, board)
             if centres is None:
-                why = f"a lattice of {columns}x{rows} circles"
+                why = description
                 continue
             start = (centres + 0.5) / scale - 0.5
             measured = circle_centres(image, board, start, options)
@@ -143,9 +143,9 @@ def _blobs(image: Integers, board: Board, options: CircleOptions) -> Iterator[Ar
         yield np.array([blob.pt for blob in detector.detect(picture)]).reshape(-1, 2)
 
 
-def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | None, tuple[int, int]]:
+def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | None, str]:
     """Centres (N, 2) px in the board's order, those without a blob by the homography of their
-    neighbours; None if the lattice is not the board's. And the lattice's columns and rows.
+    neighbours; None if the lattice is not the board's. And a description of the lattice.
     """
     asymmetric = bool(board.document.get("asymmetric", False))
     columns, rows = board.counts
@@ -153,13 +153,16 @@ def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | Non
     # the board's places and those around it, and which are its own
     around = np.stack([2 * column + row % 2 if asymmetric else column, row], axis=-1)
     own = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    turns = [lattice.cells @ turn for turn in BASES]
     fits = [
-        _placed(lattice.cells @ turn @ (DIAGONALS if asymmetric else np.eye(2, dtype=int)),
-                around[own], blobs[lattice.points])
-        for turn in BASES
-    ]  # fmt: skip
-    fits.sort(key=lambda fit: fit[:3], reverse=True)
-    cells = fits[0][3]
+        (
+            _placed(turn @ DIAGONALS if asymmetric else turn, around[own], blobs[lattice.points]),
+            turn,
+        )
+        for turn in turns
+    ]
+    fits.sort(key=lambda fit: fit[0][:3], reverse=True)
+    cells = fits[0][0][3]
     point_at = {tuple(cell): int(k) for cell, k in zip(cells.tolist(), lattice.points, strict=True)}
     points = np.array([point_at.get(tuple(cell), -1) for cell in around.tolist()])
     seen = (points >= 0).reshape(rows + 2, columns + 2)
@@ -167,15 +170,9 @@ def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | Non
         np.concatenate([seen[[k, -1 - k], 1:-1].mean(axis=1), seen[1:-1, [k, -1 - k]].mean(axis=0)])
         for k in (1, 0)
     )
-    sizes = [np.ptp(fit[3], axis=0) + 1 for fit in fits]
-    # of a lattice that is not the board's, the counts with the fewest gaps
-    counts = min(
-        ((int((width + 1) // 2 if asymmetric else width), int(height)) for width, height in sizes),
-        key=prod,
-    )
     # too few circles of an outer row or column do not tell it from a stray blob beside it
     if border.min() < FEW or beyond.max() > MAJORITY or beyond.max() >= border.min():
-        return None, counts
+        return None, _described([turn for _, turn in fits], asymmetric)
     xy, mine = board.points[:, :2], points[own]
     known = mine >= 0
     centres = np.where(known[:, None], blobs[mine], np.nan)
@@ -183,7 +180,27 @@ def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | Non
         gap = np.linalg.norm(xy[known] - xy[k], axis=-1)
         near = np.flatnonzero(known)[np.argsort(gap, kind="stable")[: CIRCLE_OPTIONS.neighbours]]
         centres[k] = _projected(_homography(xy[near], centres[near]), xy[k])
-    return centres, counts
+    return centres, board.described
+
+
+def _described(turns: list[Integers], asymmetric: bool) -> str:
+    """Description of a lattice, symmetric or not, by the counts with the fewest gaps.
+
+    turns : the lattice's cells (n, 2) in several bases; the first of equally good ones is taken.
+    asymmetric : the kind that is taken if both are equally good.
+    """
+    shapes = [
+        (np.ptp(cells @ DIAGONALS if kind else cells, axis=0).tolist(), kind)
+        for kind in (asymmetric, not asymmetric)
+        for cells in turns
+    ]
+    # every second place of an asymmetric lattice is empty
+    counts = [
+        (width // 2 + 1 if kind else width + 1, height + 1, kind)
+        for (width, height), kind in shapes
+    ]
+    columns, rows, kind = min(counts, key=lambda one: one[0] * one[1])
+    return f"{'an asymmetric' if kind else 'a'} lattice of {columns}x{rows} blobs"
 
 
 def _placed(cells: Integers, board: Integers, places: Array) -> tuple[int, int, float, Integers]:

@@ -43,9 +43,10 @@ _MODELS = {
 
 
 def is_colmap(text: str) -> bool:
-    """Whether a text is COLMAP's cameras.txt."""
+    """Whether a text is COLMAP's cameras.txt, or one of its other two."""
     first = next(iter(_lines(text)), "")
-    return _LINE.fullmatch(first) is not None or "CAMERA_ID, MODEL, WIDTH, HEIGHT" in text
+    headings = ("CAMERA_ID, MODEL, WIDTH, HEIGHT", "IMAGE_ID, QW,", "POINT3D_ID, X,")
+    return _LINE.fullmatch(first) is not None or any(one in text for one in headings)
 
 
 def read_colmap(text: str, label: str, name: str | None) -> Intrinsics:
@@ -53,18 +54,20 @@ def read_colmap(text: str, label: str, name: str | None) -> Intrinsics:
 
     name : CAMERA_ID; may be None if the file has one camera. Raises InputError.
     """
-    entries = {line.split()[0]: line for line in _lines(text)}
-    line = named_entry(entries, name, label)
-    where = f"{label}, camera {line.split()[0]}"
-    match = _LINE.fullmatch(line)
-    if match is None:
-        raise InputError(
-            "not a camera as COLMAP writes it",
-            where=where,
-            found=quoted(line),
-            expected="CAMERA_ID MODEL WIDTH HEIGHT PARAMS",
-        )
-    _, word, width, height, rest = match.groups()
+    entries: dict[str, re.Match[str]] = {}
+    for line in _lines(text):
+        match = _LINE.fullmatch(line)
+        if match is None:
+            raise InputError(
+                "not a camera as COLMAP writes it",
+                where=label,
+                found=quoted(line),
+                expected="CAMERA_ID MODEL WIDTH HEIGHT PARAMS",
+                next_step="Name the file cameras.txt beside COLMAP's images.txt and points3D.txt",
+            )
+        entries[match[1]] = match
+    number, word, width, height, rest = named_entry(entries, name, label).groups()
+    where = f"{label}, camera {number}"
     if word not in _MODELS:
         raise InputError(
             "this camera or lens model is not supported",

@@ -67,6 +67,7 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     document = parse_yaml(text, path, label)
     if cameras := _kalibr_names(document.data):
         return _from_kalibr(document, cameras, camera)
+    _check_kind(document)
     if camera is not None:
         raise _without_names(label, camera)
     if "camera_matrix" in document.data:
@@ -146,7 +147,6 @@ def camera_path(path: Path | str) -> tuple[Path, str | None]:
 
 def camera_from_document(document: Document) -> Camera:
     """Camera from a document in pkmcal's format, validated; raises InputError."""
-    _check_kind(document)
     models = camera_models()
     name = document.data.get("model")
     if not isinstance(name, str) or name not in models:
@@ -314,8 +314,9 @@ def _from_opencv(text: str, label: str) -> Camera:
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
         numbers: dict[str, Any] = {
-            key: _opencv_node(storage, names) for key, names in _OPENCV_NAMES.items()
+            key: _opencv_node(storage, names, label) for key, names in _OPENCV_NAMES.items()
         }
+        keys = storage.root().keys()
         flag, model_name = (storage.getNode(n) for n in ("fisheye_model", "distortion_model"))
         fisheye = (not flag.empty() and flag.real() != 0) or (
             not model_name.empty() and model_name.isString() and "fisheye" in model_name.string()
@@ -335,12 +336,15 @@ def _from_opencv(text: str, label: str) -> Camera:
             raise InputError(
                 f"the camera's {key} is missing",
                 where=label,
+                found=listed(keys),
                 expected=_OPENCV_NAMES[key][0],
                 next_step="Add it; a lens without distortion has five zeros"
                 if key == "distortion"
-                else "Add it, as cv2.FileStorage writes it",
+                else "Add it, or calibrate again from images of a board: pkmcal camera",
             )
-    for key, count in (("matrix", 9), ("width", 1), ("height", 1), ("xi", 1)):
+    k, xi = numbers["distortion"], numbers["xi"]
+    counts = {"matrix": 9, "distortion": len(k), "width": 1, "height": 1, "xi": 1}
+    for key, count in counts.items():
         values = numbers[key]
         if values is not None and (len(values) != count or not np.all(np.isfinite(values))):
             raise InputError(
@@ -350,22 +354,34 @@ def _from_opencv(text: str, label: str) -> Camera:
                 expected=count_of(count, "finite number"),
             )
     size = float(numbers["width"][0]), float(numbers["height"][0])
-    k, xi = numbers["distortion"], numbers["xi"]
     model = "unified" if xi is not None else "fisheye" if fisheye else _opencv_model(k)
     own = {} if xi is None else {"xi": float(xi[0])}
     _check_coefficients(k, f"{label}, {_OPENCV_NAMES['distortion'][0]}")
-    return _camera_from_numbers(model, size, numbers["matrix"], k, own, label)
+    where = f"{label}, {_OPENCV_NAMES['matrix'][0]}"
+    return _camera_from_numbers(model, size, numbers["matrix"], k, own, where)
 
 
-def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
-    """Numbers (n,) under the first of several names that an OpenCV file has, or None."""
+def _opencv_node(storage: Any, names: tuple[str, ...], label: str) -> Array | None:
+    """Numbers (n,) under the first of several names that an OpenCV file has, or None; raises
+    InputError for a matrix without them.
+    """
+    import cv2
+
     for name in names:
         node = storage.getNode(name)
         if node.empty():
             continue
         if node.isInt() or node.isReal():
             return np.array([node.real()])
-        matrix = node.mat()
+        try:
+            matrix = node.mat()
+        except cv2.error:
+            raise InputError(
+                "this is no matrix as OpenCV writes it",
+                where=f"{label}, {name}",
+                expected="rows, cols, dt, and as many numbers as rows times cols",
+                next_step="Correct it, or calibrate again from images of a board: pkmcal camera",
+            ) from None
         if matrix is not None:
             return np.asarray(matrix, dtype=float).reshape(-1)
     return None
@@ -556,7 +572,8 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
     pair = (str(word), str(data.get("distortion_model", "none")))
     if pair not in _KALIBR:
         models = ["-".join(names) for names in _KALIBR]
-        raise _unsupported(document.where(key, "camera_model"), "-".join(pair), models)
+        field = "distortion_model" if any(pair[0] == one for one, _ in _KALIBR) else "camera_model"
+        raise _unsupported(document.where(key, field), "-".join(pair), models)
     model = _KALIBR[pair]
     names = camera_models()[model].own
     intrinsics = _numbers_at(document, (key, "intrinsics"), (len(names) + 4,))
@@ -613,8 +630,10 @@ def _camera_from_numbers(
     m = np.asarray(matrix, dtype=float).reshape(3, 3)
     rest = [m[1, 0], *m[2]]
     faults = (
+        (not m.any(), "a matrix of zeros, so it was never calibrated", quoted(m.ravel().tolist())),
+        (not np.all(np.isfinite(m)), "a matrix that is not finite", quoted(m.ravel().tolist())),
+        (not np.all(np.isfinite(k)), "distortion that is not finite", quoted(k.tolist())),
         (m[0, 1] != 0, "skew, which no model here has", f"{m[0, 1]:g}"),
-        (not np.all(np.isfinite([*m.ravel(), *k])), "numbers that are not finite", "nan or inf"),
         (
             not np.allclose(rest, [0, 0, 0, 1]),
             "a matrix that is not [fx, 0, cx, 0, fy, cy, 0, 0, 1], row by row",
@@ -629,7 +648,12 @@ def _camera_from_numbers(
     )
     for wrong, what, item in faults:
         if wrong:
-            raise InputError(f"the camera has {what}", where=where, found=item)
+            raise InputError(
+                f"the camera has {what}",
+                where=where,
+                found=item,
+                next_step="Correct the file, or calibrate from images of a board: pkmcal camera",
+            )
     fields: dict[str, Any] = {
         "model": model,
         "image_size": [round(n) for n in size],

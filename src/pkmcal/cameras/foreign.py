@@ -51,7 +51,7 @@ def named_entry(entries: Mapping[str, Entry], name: str | None, label: str) -> E
         )
     if name is None or name not in entries:
         raise InputError(
-            "the file has no such camera",
+            "the file has no such camera" if entries else "the file holds no camera",
             where=label,
             found=name,
             expected=listed(list(entries)) or "a camera",

@@ -19,7 +19,7 @@ _WITH, _WITHOUT = "perspectiveProjWithDistortion", "perspectiveProjWithoutDistor
 
 def is_visp(text: str) -> bool:
     """Whether a text is a camera file of ViSP."""
-    return all(tag in text for tag in ("<camera>", "<model>", "<px>"))
+    return all(tag in text for tag in ("<camera>", "<model>"))
 
 
 def read_visp(text: str, label: str, name: str | None) -> Intrinsics:
@@ -31,8 +31,13 @@ def read_visp(text: str, label: str, name: str | None) -> Intrinsics:
         if text.count("<!") > text.count("<!--"):
             raise ParseError  # a document type, whose entities have no place in a camera file
         root = fromstring(text)
-    except (ParseError, ValueError):
-        raise InputError("not valid as ViSP writes it", where=label) from None
+    except (ParseError, ValueError) as error:
+        raise InputError(
+            "not valid as ViSP writes it",
+            where=label,
+            found=str(error) or "a document type",
+            next_step="Write it again with vpXmlParserCamera",
+        ) from None
     cameras = {(one.findtext("name") or "").strip(): one for one in root.iter("camera")}
     camera = named_entry(cameras, name, label)
     models = {(one.findtext("type") or "").strip(): one for one in camera.iter("model")}
