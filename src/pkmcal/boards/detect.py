@@ -224,8 +224,8 @@ def check_any(detections: Sequence[Detection], board: Board) -> None:
             where=listed([detection.name for detection in detections], 3),
             found=detections[0].reason,
             expected=board.described,
-            next_step="Check the board file, the light and the focus; a chessboard's white border"
-            " must be seen as well",
+            next_step="Check the board file, the light and the focus"
+            + ("; its white border must be seen as well" if board.type == "chessboard" else ""),
             code="board.not_found",
         )
 
