@@ -264,8 +264,13 @@ def _searched(
         """Search images side by side; each is counted when it is ready."""
         progress(text, 0.0)
         tasks = {k: pool.submit(one, k) for k in some}
-        for done, _ in enumerate(as_completed(tasks.values()), start=1):
-            progress(f"{text}: {done} of {len(some)}", done / len(some))
+        try:
+            for done, task in enumerate(as_completed(tasks.values()), start=1):
+                task.result()
+                progress(f"{text}: {done} of {len(some)}", done / len(some))
+        finally:  # after an error, images that have not begun are not searched
+            for task in tasks.values():
+                task.cancel()
         answers.update((k, task.result()) for k, task in tasks.items())
 
     def rescore(some: Sequence[int], text: str, progress: Progress) -> None:
@@ -395,6 +400,7 @@ class _CachedHypotheses:
     scores : by the joint estimate, None before it.
     by : marginal prior of the machine at that time, None for the nominal model.
     beside : number of images that determined the machine.
+    beside_neighbours : whether poses by the background of single neighbours have been tried.
     anew : whether ``hypotheses`` are by a machine from images.
     """
 
@@ -403,6 +409,7 @@ class _CachedHypotheses:
     scores: ScoredPoses | None = None
     by: MarginalPrior | None = None
     beside: int = 0
+    beside_neighbours: bool = False
     anew: bool = False
 
 
@@ -494,14 +501,15 @@ def _search(
     """Pose hypotheses of an image, weighted by its legs and by the background.
 
     The background is compared with that of the images with accepted poses; earlier hypotheses are
-    among the candidates. An image that stays ambiguous is localized with the first machine from
-    images: by itself once more, among more hypotheses, because later images change the machine
-    little, and by the background of each of its neighbours. Poses that were scored with a similar
-    machine are not scored again.
+    among the candidates. An image that stays ambiguous is localized with the machine from images:
+    by the background of each of its neighbours and, if that does not suffice, once by itself among
+    more hypotheses, because later images change the machine little. Poses that were scored with a
+    similar machine are not scored again.
     """
     p, scene, placed, k = image.decoded(), so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
-    anew = before.anew or (scene.prior is not None and before.scores is not None)
+    by_neighbours = scene.prior is not None and before.scores is not None
+    anew = before.anew or before.beside_neighbours
     if anew and not before.anew:
         alone = _image_hypotheses(session, scene, p, _OPTIONS.wider)
     elif (
@@ -518,13 +526,13 @@ def _search(
     if placed:
         axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
-    if placed and anew:
+    if placed and by_neighbours:
         others = np.concatenate([others, _by_neighbours(session, room, so_far, p, tables)])
     # joint estimate, then the background
     closer, scores = rescore_poses(session, p, scene, alone, others, scores, tables)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
-    return _CachedHypotheses(alone, places, scores, by, beside, anew)
+    return _CachedHypotheses(alone, places, scores, by, beside, by_neighbours, anew)
 
 
 def _by_neighbours(

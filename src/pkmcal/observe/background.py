@@ -191,39 +191,42 @@ def beside_machine(
 
 def agreement(
     one: Array, other: Array, T_other_one: Array, options: BackgroundOptions = BACKGROUND_OPTIONS
-) -> float:
-    """Log-likelihood ratio that matched unit rays (n, 3) observe the same points, against chance.
+) -> Array:
+    """Log-likelihood ratios (H,) that matched unit rays (n, 3) observe the same points, against
+    chance.
 
     A match is either correct, with a share common to all matches, or distributed as matches with
     exchanged partners. The share and the spread of the correct matches are maximized over, and each
     costs half the logarithm of n (Schwarz, Annals of Statistics 6, 1978). Zero for fewer than
     the options' fewest matches.
 
-    T_other_one : (4, 4), from the frame of the first camera to that of the other.
+    T_other_one : (H, 4, 4), from the frame of the first camera to that of the other.
     """
     if len(one) < options.fewest_pairs:
-        return 0.0
-    # normals of the epipolar planes
-    ray = one @ T_other_one[:3, :3].T
-    normal = cross(np.broadcast_to(T_other_one[:3, 3], ray.shape), ray)
-    normal /= np.maximum(np.sqrt(dot(normal, normal)), 1e-12)[:, None]
-    # angles from the planes, and their density by chance: that of all exchanged partners
-    sine = normal @ other.T
-    off = np.arcsin(np.clip(np.diagonal(sine), -1, 1))
-    np.fill_diagonal(sine, np.inf)
-    near = np.count_nonzero(np.abs(sine) < np.sin(options.window))
-    chance = max(near, 1) / (sine.size - len(sine)) / (2 * options.window)
+        return np.zeros(len(T_other_one))
+    # normals (H, n, 3) of the epipolar planes
+    ray = one @ T_other_one[:, :3, :3].mT
+    normal = cross(T_other_one[:, None, :3, 3], ray)
+    normal /= np.maximum(np.sqrt(dot(normal, normal)), 1e-12)[..., None]
+    # angles (H, n) from the planes, and their density (H, 1, 1) by chance: that of all exchanged
+    # partners
+    sine, window = dot(normal, other), np.sin(options.window)
+    near = np.array([np.count_nonzero(np.abs(own @ other.T) < window) for own in normal])
+    near -= np.count_nonzero(np.abs(sine) < window, axis=1)
+    count = len(one) * (len(one) - 1)
+    chance = (np.maximum(near, 1) / count / (2 * options.window))[:, None, None]
+    off = np.arcsin(np.clip(sine, -1, 1))[:, None]
     # maximum over share and spread, less the penalty of both; the gain is concave in the share
     spread = np.array(options.spreads)[:, None]
     density = np.exp(-0.5 * (off / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
     excess = density / chance - 1
-    least, most = (np.full((len(spread), 1), share) for share in options.shares)
+    least, most = (np.full((*excess.shape[:2], 1), share) for share in options.shares)
     for _ in range(options.share_bisections):
         share = (least + most) / 2
-        rises = np.sum(excess / (1 + share * excess), axis=1, keepdims=True) > 0
+        rises = np.sum(excess / (1 + share * excess), axis=-1, keepdims=True) > 0
         least, most = np.where(rises, share, least), np.where(rises, most, share)
     gain = np.log1p((least + most) / 2 * excess).sum(axis=-1)
-    return max(float(gain.max()) - np.log(len(one)), 0.0)
+    return np.maximum(gain.max(axis=-1) - np.log(len(one)), 0.0)
 
 
 class Neighbour(NamedTuple):
@@ -493,16 +496,17 @@ class Surroundings:
         outside = [
             beside_machine(texture.pixel, camera, axes, options=self.options) for axes in legs
         ]
+        # rows of the poses with the same legs
+        rows = [slice(h, h + 1) for h in range(len(legs))] if len(legs) > 1 else [slice(None)]
         for n, other in enumerate(nearest):
             in_view = placed[other]
             j, k = self.shared(one, other)
             beside = self._beside(other, k, in_view)
-            for h, T in enumerate(T_camera_base):
-                ok = beside & outside[h % len(outside)][j]
+            T_other_one = in_view.T_camera_base @ inverse(T_camera_base)
+            for which, own in zip(rows, outside, strict=True):
+                ok = beside & own[j]
                 rays = texture.ray[j[ok]], self.texture(other).ray[k[ok]]
-                gain[h, n] = agreement(
-                    *rays, in_view.T_camera_base @ inverse(T), options=self.options
-                )
+                gain[which, n] = agreement(*rays, T_other_one[which], options=self.options)
         # the best of several rotations and neighbours is chosen: the number of trials is paid for
         tries = len(nearest) * len(self.options.turns)
         return np.maximum(np.logaddexp.reduce(gain, axis=1) - np.log(tries), 0.0)

@@ -44,12 +44,11 @@ from pkmcal.observe.pose_likelihood import (
     StationView,
     distances_under,
     distinct_silhouettes,
-    divided,
     mixture_of,
     refine_lm,
     refine_ml,
 )
-from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed, visible_stretch
+from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
 from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, TubeChart, TubeChartOptions, tube_chart
 
 
@@ -391,17 +390,8 @@ def _log_likelihood(view: StationView, values: Array, samples: int) -> Array:
     """Log-likelihood ratios (H,) of poses (H, 4, 4) by the silhouettes that no other leg hides or
     borders: with two legs on one line in the image, its edges would count twice.
     """
-    parts = divided(view, len(values), samples)
-    if len(parts) > 1:
-        return np.concatenate([_log_likelihood(view, values[k], samples) for k in parts])
     one = np.zeros(1, dtype=int)
-    distances = distances_under(view, values, one, samples)
-    legs = view.legs(one).under(values)[:, 0]
-    points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
-    clear = unobstructed(
-        view.machine, view.camera, legs, view.tubes, points, EDGE_OPTIONS.clearance
-    )
-    distances = distances._replace(length=np.where(clear, distances.length, 0.0))
+    distances = distances_under(view, values, one, samples, EDGE_OPTIONS.clearance)
     return distances.log_likelihood(mixture_of(distances, view.options)).sum(axis=(1, 2))
 
 
