@@ -27,7 +27,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import PriorScene
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.bundle import Fit, fit_state, fit_states, marginalize_to_machine
+from pkmcal.identify.bundle import BATCH, Fit, fit_state, fit_states, marginalize_to_machine
 from pkmcal.identify.start import start_state
 from pkmcal.identify.state import State
 from pkmcal.measurements import EdgeSet, of_stations
@@ -187,7 +187,11 @@ def evaluate_poses(
         EvaluatedPose(scene.machine, replace(begin, T_camera_base=T[None]), EdgeSet.empty(), 0.0)
         for T in T_camera_base
     ]
-    for _ in range(_OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal):
+    n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
+    for number in range(n_passes):
+        # while edges are matched from errors of pixels, weights and noise need not converge
+        rough = number < n_passes - _OPTIONS.passes_from_prior
+        options = replace(BATCH, most_rounds=0) if rough else BATCH
         before = {k: one for k, one in enumerate(results) if isinstance(one, EvaluatedPose)}
         edges = [
             silhouette_edges(one.view_in(view), one.T_camera_base, 0).edges.scaled(scene.scatter)
@@ -195,7 +199,7 @@ def evaluate_poses(
         ]
         measurements = [replace(nothing, edges=own) for own in edges]
         starts = [one.state for one in before.values()]
-        fits = fit_states(session.machine, measurements, starts, scene.prior)
+        fits = fit_states(session.machine, measurements, starts, scene.prior, options)
         for k, own, fit in zip(before, edges, fits, strict=True):
             failed = isinstance(fit, PkmcalError)
             results[k] = fit if failed else EvaluatedPose(fit.machine, fit.state, own, fit.change)
