@@ -13,6 +13,7 @@ Computer Vision 60, 2004) with square-rooted descriptors (Arandjelovic and Zisse
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import combinations
@@ -20,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import THREADS, Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import cross, dot, inverse, pose, rotation
 from pkmcal.observe.image_localization import PoseHypotheses
@@ -320,6 +321,8 @@ class Surroundings:
         other.
         """
         results: dict[int, list[tuple[Array, Integers]]] = {k: [] for k in placed}
+        with ThreadPoolExecutor(THREADS) as pool:  # matches take nearly all of the time
+            list(pool.map(lambda pair: self.shared(*pair), combinations(placed, 2)))
         for one, other in combinations(placed, 2):
             j, k = self.shared(one, other)
             if not len(j):
@@ -388,8 +391,9 @@ class Surroundings:
 
         Two images determine their relative pose up to the distance of the cameras, for which the
         values ``apart`` (D,), m, are used. Neighbours with too few matches are left out. The
-        relative pose is by the five-point method in RANSAC (Nister, IEEE Transactions on Pattern
-        Analysis and Machine Intelligence 26, 2004).
+        relative pose is by the five-point method (Nister, IEEE Transactions on Pattern Analysis and
+        Machine Intelligence 26, 2004) in RANSAC with local optimization (USAC: Raguram and others,
+        IEEE Transactions on Pattern Analysis and Machine Intelligence 35, 2013).
         """
         import cv2
 
@@ -405,7 +409,7 @@ class Surroundings:
                 continue
             here, there = (np.ascontiguousarray(ray[ok, :2] / ray[ok, 2:]) for ray in rays)
             essential, inside = cv2.findEssentialMat(
-                there, here, np.eye(3), cv2.RANSAC, self.options.confidence, off,
+                there, here, np.eye(3), cv2.USAC_DEFAULT, self.options.confidence, off,
                 self.options.quintuples,
             )  # fmt: skip
             if essential is None or essential.shape != (3, 3):  # no solution, or several
