@@ -15,6 +15,7 @@ from pkmcal.viewing.gestures import (
     farther,
     pinned,
     rolled,
+    triangle_poses,
     turned_as_ball,
 )
 
@@ -97,6 +98,24 @@ def test_joints_come_to_their_places(camera, points, count):
         error = pose_difference(inverse(done), inverse(truth))
         assert np.linalg.norm(error[:3]) < 1e-3
         assert np.linalg.norm(error[3:]) < 1e-3
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_three_joints_have_up_to_four_poses_the_true_one_among_them(camera, points, count):
+    truth = perturb(T, np.array([0.4, -0.8, 1.0, 0.05, -0.04, 0.08]))
+    pins = points[[0, 9, 4, 7, 2][:count]]
+    places = projected(camera, truth, pins)
+    poses = triangle_poses(camera, pins, places)
+    assert 1 <= len(poses) <= 4
+    errors = [np.linalg.norm(pose_difference(one, truth)) for one in poses]
+    assert min(errors) < 1e-5
+    exact = [np.sort(np.abs(projected(camera, one, pins) - places).max(axis=1)) for one in poses]
+    np.testing.assert_allclose(np.array(exact)[:, :3], 0.0, atol=1e-3)
+
+
+def test_two_joints_have_no_such_pose(camera, points):
+    places = projected(camera, T, points[:2])
+    assert triangle_poses(camera, points[:2], places).shape == (0, 4, 4)
 
 
 def test_a_pull_outside_the_picture_of_a_mirror_moves_nothing(points):

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from conftest import FEW_IMPUTATIONS
 from faults import raises, replaced
@@ -65,6 +66,7 @@ from pkmcal.observe.image_localization import (
     finest_view,
     localize_image,
     localize_near,
+    log_prior_by_hand,
     symmetric_poses,
 )
 from pkmcal.observe.images import decode
@@ -929,6 +931,39 @@ def test_turns_of_a_machine_onto_itself(searched):
         apart = np.linalg.norm(turned[:, None] - first, axis=-1)
         assert np.all(apart.min(axis=1) < 0.06)
         assert np.all(apart.argmin(axis=1) != np.arange(6))
+
+
+def test_a_pose_by_hand_is_as_likely_as_with_another_leg_for_the_first(searched):
+    """Within the hand's error it is a normal density; elsewhere one in ten remains."""
+    session, images, poses, truth = searched
+    view, true, sigma = view_of(session, images[0], poses), truth.T_camera_base[0], 0.1
+    same = symmetric_poses(view, true[None])
+    ends = session.machine.ends_at(view.joints, view.poses)
+    middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
+
+    def turned(angle):
+        turn = rotation(np.array([0.0, 0.0, angle]))
+        return true @ pose(turn, middle - turn @ middle)
+
+    far = true.copy()
+    far[2, 3] += 100 * sigma * np.linalg.norm(far[:3, 3])
+    others = np.stack([true, *same, turned(2 * sigma), far])
+    nats = log_prior_by_hand(view, true, others, sigma)
+    np.testing.assert_allclose(nats[:3], nats[0], atol=0.01)
+    assert abs(nats[0] - nats[3] - 2.0) < 0.01
+    assert abs(nats[4] - np.log(0.1)) < 1e-9
+    # against all rotations, and directions and distances over the middle of the image
+    camera = images[0].camera
+    (fx, fy, cx, cy), distortion = camera.parameters[:4], camera.parameters[4:]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    x, y = np.array(camera.image_size) - 1
+    edges = np.array([[0, y / 2], [x, y / 2], [x / 2, 0], [x / 2, y]])
+    rays = cv2.convertPointsToHomogeneous(cv2.undistortPoints(edges, matrix, distortion))[:, 0]
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    width, height = np.arccos(rays[0] @ rays[1]), np.arccos(rays[2] @ rays[3])
+    anywhere = 8 * np.pi**2 * (0.4 * width) * (0.4 * height) * np.log(1.5 / 0.3)
+    peak = multivariate_normal(np.zeros(6), sigma**2 * np.eye(6)).pdf(np.zeros(6))
+    assert abs(nats[0] - np.log(0.3 * peak * anywhere + 0.1)) < 0.01
 
 
 def test_a_similar_pose_is_distinguished_by_the_machine_there(searched):

@@ -16,14 +16,15 @@ half of a leg counts as one measurement.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import dot, inverse, pose, rotation
+from pkmcal.geometry.rigid import angle_between, apply, dot, inverse, pose, rotation
+from pkmcal.levels import NEARLY_ALL
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.distance_tables import (
     DISTANCE_TABLE_OPTIONS,
@@ -157,16 +158,21 @@ class PoseHypotheses(NamedTuple):
         return PoseHypotheses(self.T_camera_base[order], total[order], self.unit)
 
     @property
+    def probabilities(self) -> Array:
+        """Probability (H,) of each hypothesis, given that it or the first one is correct."""
+        nats = (self.log_likelihood_ratio[0] - self.log_likelihood_ratio) / self.unit
+        return 1 / (1 + np.exp(np.minimum(nats, 500.0)))
+
+    @property
     def rival_probability(self) -> float:
         """Probability that the second hypothesis is the correct one, given that one of the first
         two is.
 
         Without a second hypothesis, the comparison is with chance.
         """
-        second = float(self.log_likelihood_ratio[1]) if len(self.log_likelihood_ratio) > 1 else 0.0
-        return 1 / (
-            1 + float(np.exp(min((self.log_likelihood_ratio[0] - second) / self.unit, 500.0)))
-        )
+        if len(self.log_likelihood_ratio) > 1:
+            return float(self.probabilities[1])
+        return 1 / (1 + float(np.exp(min(self.log_likelihood_ratio[0] / self.unit, 500.0))))
 
 
 def localize_image(
@@ -346,6 +352,7 @@ def with_neighbours(
     view: StationView,
     image: Integers,
     T_camera_base: Array,
+    log_prior: Callable[[Array], Array],
     options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
 ) -> PoseHypotheses:
     """Pose hypotheses of the camera of one image from poses (H, 4, 4), best first, with the rivals
@@ -353,13 +360,52 @@ def with_neighbours(
 
     Without these searches, a local maximum of the likelihood beside the correct pose would have no
     rival.
+
+    log_prior : log prior (H,), nats, of poses (H, 4, 4).
     """
-    hypotheses = weighed_poses(view, image, T_camera_base, options)
+
+    def weighed(poses: Array) -> PoseHypotheses:
+        hypotheses = weighed_poses(view, image, poses, options)
+        return hypotheses.weighed(log_prior(hypotheses.T_camera_base))
+
+    hypotheses = weighed(T_camera_base)
     for seed in range(1, options.near_rounds + 1):
         near = localize_near(view, image, hypotheses.T_camera_base[0], options, seed)
-        poses = np.concatenate([hypotheses.T_camera_base, near.T_camera_base])
-        hypotheses = weighed_poses(view, image, poses, options)
+        hypotheses = weighed(np.concatenate([hypotheses.T_camera_base, near.T_camera_base]))
     return hypotheses
+
+
+def log_prior_by_hand(
+    view: StationView,
+    T_camera_base: Array,
+    other: Array,
+    sigma: float,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> Array:
+    """Log prior (H,), nats, of poses ``other`` (H, 4, 4) after a person has set one (4, 4), against
+    that of poses anywhere.
+
+    Nearly all poses set by hand are right, up to the numbers of the legs of a machine of equal
+    parts. The rest tell nothing.
+
+    sigma : of a hand, rad: of each rotation about the machine's middle, and of the direction to it;
+        and of the distance, relative.
+    """
+    set_by_hand = T_camera_base[None]
+    equal = np.concatenate([set_by_hand, symmetric_poses(view, set_by_hand, options)])
+    middle = _machine_middle(view)
+    equal_middle, other_middle = apply(equal, middle), apply(other, middle)
+    shift = (other_middle[:, None] - equal_middle) / np.linalg.norm(equal_middle, axis=-1)[:, None]
+    turn = angle_between(other[:, None], equal)
+    square = (turn**2 + dot(shift, shift)) / sigma**2
+    near = np.exp(-square / 2).sum(axis=1) / len(equal) / (np.sqrt(2 * np.pi) * sigma) ** 6
+    # all rotations, and the directions and distances of the search without a prior
+    last = np.array(view.camera.image_size) - 1
+    rays = view.camera.ray(last / 2 + last / 2 * np.array([[[-1, 0], [1, 0]], [[0, -1], [0, 1]]]))
+    view_angles = np.nan_to_num(np.arccos(dot(rays[:, 0], rays[:, 1])), nan=np.pi)
+    width, height = 2 * options.off_middle * view_angles
+    everywhere = 8 * np.pi**2 * width * height * np.log(options.filled[1] / options.filled[0])
+    return np.log(NEARLY_ALL * near * everywhere + 1 - NEARLY_ALL)
 
 
 def _starts_near(
@@ -371,14 +417,19 @@ def _starts_near(
     """A pose (4, 4), and random ones around it: rotated about the middle of the machine, and
     shifted; (near_starts, 4, 4).
     """
-    ends = view.machine.ends_at(view.joints, view.poses)
-    middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
+    middle = _machine_middle(view)
     turn = rotation(rng.normal(size=(options.near_starts, 3)) * options.near_turn)
     turn[0] = np.eye(3)
     starts = T_camera_base @ pose(turn, middle - turn @ middle)
     away = np.sqrt(dot(starts[0, :3, 3], starts[0, :3, 3]))
     starts[1:, :3, 3] += away * rng.normal(size=(options.near_starts - 1, 3)) * options.near_shift
     return starts
+
+
+def _machine_middle(view: StationView) -> Array:
+    """Mean (3,) of the machine's joints in the first configuration of a view, base frame, m."""
+    ends = view.machine.ends_at(view.joints, view.poses)
+    return np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
 
 
 def _most(view: StationView, values: Array, samples: int, count: int) -> Array:

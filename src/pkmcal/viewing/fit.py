@@ -11,17 +11,26 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
 from pkmcal.levels import OUTLIER_SIGMAS
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.image_localization import localize_image, localize_near, with_neighbours
+from pkmcal.observe.image_localization import (
+    localize_image,
+    localize_near,
+    log_prior_by_hand,
+    symmetric_poses,
+    with_neighbours,
+)
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, LocalizedPose, find_station
+from pkmcal.outcome.hypotheses import HYPOTHESIS_THRESHOLDS
 from pkmcal.viewing.content import SessionContent
+from pkmcal.viewing.gestures import HAND_POSE_SIGMA
 from pkmcal.viewing.overlay import (
     overlay_after_gesture,
     pane_of,
     pin_distances,
     placed_by_hand,
     pose_rows,
+    poses_by_pins,
 )
 from pkmcal.web.session_document import LocalizationAnswer, ViewRequest
 from pkmcal.wording import brief, count
@@ -35,6 +44,8 @@ FEWEST_FITTED_TOGETHER = 2
 """Fewest images of which some can verify the pose that the others give."""
 MOST_PLACES = 5
 """Poses between which a person can choose."""
+DISTINCT_DEGREES = 1.0
+"""Rotation, degrees, from which two poses are told apart in words: a text has no decimals."""
 LEAST_CHANCE_DISPLAYED = 1e-9
 """Probability below which no digits are displayed."""
 
@@ -92,17 +103,13 @@ def localized_overlay(content: SessionContent, request: ViewRequest) -> Localiza
             next_step="Its place is found from the board when you calibrate",
         )
     start = placed_by_hand(content, request).T_camera_base
-    unplaced = station.T_camera_base is None and np.allclose(
-        start, pane_of(content, request).T_camera_base
-    )
-    near = None if request.anywhere or unplaced else start
     joints = _PlacedJoints(content, request, start)
     # several images verify each other
     view = _search_view(content, request.station)
     if len(view.configuration) >= FEWEST_FITTED_TOGETHER:
         judgement = _from_images(view, None if request.anywhere else start, joints)
     else:
-        judgement = _from_one_image(view, near, joints)
+        judgement = _from_one_image(view, joints)
     poses = judgement.T_camera_base
     # overlay at the localized pose, without the gesture and pins that led to the start
     pose = pose_rows(poses[0] if judgement.localized else start)
@@ -144,32 +151,69 @@ def _from_images(view: StationView, start: Array | None, joints: _PlacedJoints) 
     return _Judgement(pose.T_camera_base[None], pose.good and not moved, text)
 
 
-def _from_one_image(view: StationView, start: Array | None, joints: _PlacedJoints) -> _Judgement:
-    """Localization from the only image of a station, everywhere and near a start.
+def _from_one_image(view: StationView, joints: _PlacedJoints) -> _Judgement:
+    """Localization from the only image of a station, everywhere and near what a person placed.
 
-    The start is no evidence: a person may take one leg of a machine of equal parts for another. The
-    joints that a person placed are.
+    A pose set by hand is as likely as its symmetric poses: a person may take one leg of a machine
+    of equal parts for another. Joints that a person placed decide between them.
     """
-    content, s = joints.content, joints.request.station
-    image = content.image(s, joints.request.image)
+    content, request = joints.content, joints.request
+    s, image = request.station, content.image(request.station, request.image)
     # the search everywhere takes most of the time, and the user fits repeatedly
     if s not in content.poses_anywhere:
         content.poses_anywhere[s] = localize_image(view, image).T_camera_base
-    poses = content.poses_anywhere[s]
-    if start is not None:
-        poses = np.concatenate([localize_near(view, image, start).T_camera_base, poses])
-    hypotheses = with_neighbours(view, image, poses)
-    by_hand = np.array([joints.log_likelihood(T) for T in hypotheses.T_camera_base])
-    hypotheses = hypotheses.weighed(by_hand)
-    pose = LocalizedPose.of_image(hypotheses, has_prior=start is not None)
-    probability, rivals = brief(pose.p_value), hypotheses.T_camera_base[1:]
-    moved = joints.contradiction(pose.T_camera_base)
+    # starts: by the pins, and as the hand set the pose before, with the symmetric ones
+    starts = poses_by_pins(content, request)
+    by_hand = placed_by_hand(content, request.model_copy(update={"pins": ()})).T_camera_base
+    unplaced = content.station(s).T_camera_base is None and np.allclose(
+        by_hand, pane_of(content, request).T_camera_base
+    )
+    has_prior = not (request.anywhere or unplaced)
+    if has_prior or request.pins:
+        start = joints.start[None]
+        starts = np.concatenate([starts, start, symmetric_poses(view, start)])
+    near = [localize_near(view, image, T).T_camera_base for T in starts]
+    poses = np.concatenate([*near, content.poses_anywhere[s]])
+
+    def pin_evidence(poses: Array) -> Array:
+        return np.array([joints.log_likelihood(T) for T in poses])
+
+    def log_prior(poses: Array) -> Array:
+        if not has_prior:
+            return pin_evidence(poses)
+        return pin_evidence(poses) + log_prior_by_hand(view, by_hand, poses, HAND_POSE_SIGMA)
+
+    hypotheses = with_neighbours(view, image, poses, log_prior)
+    # poses that a search near the first one reaches are told apart by further images
+    first, reach = hypotheses.T_camera_base[0], LOCALIZATION_OPTIONS.near
+    beside = np.array([reach.reaches(first, T) for T in hypotheses.T_camera_base])
+    rivals = hypotheses.select(np.flatnonzero(~beside | (np.arange(len(beside)) == 0)))
+    pose = LocalizedPose.of_image(rivals, has_prior=has_prior)
+    equals = hypotheses.select(beside & (hypotheses.probabilities > LOCALIZATION_OPTIONS.rival))
+    within = float(np.degrees(angle_between(equals.T_camera_base, first).max(initial=0.0)))
+    # pins decide where the image leaves a choice, and do not overrule it
+    nats = hypotheses.log_likelihood_ratio / hypotheses.unit - pin_evidence(
+        hypotheses.T_camera_base
+    )
+    overruled = nats[~beside].max(initial=-np.inf) - nats[0] > HYPOTHESIS_THRESHOLDS.report
+    probability = brief(pose.p_value)
+    moved = joints.contradiction(first)
     if pose.good and moved:
         text = _contradicted(moved)
-    elif pose.good:
+    elif pose.good and overruled:
+        text = (
+            "Not placed: at another place the legs fit this image much better than where you put"
+            " the joints. Bring another joint to its place, or check the numbers of the legs."
+        )
+    elif pose.good and within < DISTINCT_DEGREES:
         text = "Placed: from no other place does the machine fit as well."
-    elif len(rivals):
-        turn = np.degrees(angle_between(rivals[0], pose.T_camera_base))
+    elif pose.good:
+        text = (
+            "Placed: from no other place does the machine fit as well. Poses up to"
+            f" {within:.0f}° from this one fit nearly as well; further images tell them apart."
+        )
+    elif len(rivals.T_camera_base) > 1:
+        turn = np.degrees(angle_between(rivals.T_camera_base[1], first))
         text = (
             "Not placed: from several places the machine fits this image nearly as well. The second"
             f" best, turned by {turn:.0f}° against the best, is the right one with probability"
@@ -181,7 +225,7 @@ def _from_one_image(view: StationView, start: Array | None, joints: _PlacedJoint
             "Not placed: the best fit may be by chance, with probability"
             f" {probability}. Bring it to where it is, joint by joint."
         )
-    return _Judgement(hypotheses.T_camera_base, pose.good and not moved, text)
+    return _Judgement(rivals.T_camera_base, pose.good and not (moved or overruled), text)
 
 
 def _contradicted(moved: float) -> str:

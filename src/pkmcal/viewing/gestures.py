@@ -8,6 +8,7 @@ middle. The four gestures together cover the six degrees of freedom of a pose.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import combinations
 
 import numpy as np
 
@@ -17,17 +18,17 @@ from pkmcal.geometry.rigid import apply, pose, rotation
 
 PINNED_JOINT_SIGMA = 2.0
 """Standard deviation of a joint placed by hand, px."""
-HAND_POSE_SPREAD = np.array([*np.full(3, np.radians(6.0)), 0.1, *np.full(2, np.radians(6.0))])
-"""Prior sigmas of the hand-set pose that three or more pinned joints adjust.
-
-Aim and roll (rad), relative distance, turns (rad). They only decide what the joints leave
-undetermined.
-"""
+HAND_POSE_SIGMA = np.radians(6.0)
+"""Standard deviation of a pose set by hand: of aim, roll and turns, rad, and of the distance,
+relative. A rough pose is asked for within 10 degrees, the norm over three axes."""
 PINNING_ROUNDS = 4
 """Repetitions in which the result replaces the hand-set pose as the mean of the prior.
 
 The prior then affects only what the joints leave undetermined.
 """
+LEAST_DEPTH = 0.05
+"""Third coordinate of a unit ray below which a ray, 87 degrees off the axis, has no usable point in
+the plane before the camera."""
 UNSEEN_JOINT_PIXELS = 1e3
 """Residual, px, of a joint that does not project into the image."""
 
@@ -90,7 +91,6 @@ def pinned(
     from scipy.optimize import least_squares
 
     freedoms = 4 if len(pins) == 2 else 6
-    spread = HAND_POSE_SPREAD[:freedoms]
 
     # two joints fix aim, roll and distance exactly; more are fitted together with the prior
     def misfit(shifted: Callable[[Array], Array]) -> Callable[[Array], Array]:
@@ -100,7 +100,7 @@ def pinned(
         """
 
         def rows(x: Array) -> Array:
-            visible = camera.project(apply(shifted(x * spread), pins))
+            visible = camera.project(apply(shifted(x * HAND_POSE_SIGMA), pins))
             off = (
                 np.nan_to_num(visible - pixels, nan=UNSEEN_JOINT_PIXELS).ravel()
                 / PINNED_JOINT_SIGMA
@@ -113,8 +113,31 @@ def pinned(
         shifted = _motion(T_camera_base, points)
         with np.errstate(over="ignore"):  # a pixel may be kilometres away
             x = least_squares(misfit(shifted), np.zeros(freedoms)).x
-        T_camera_base = shifted(x * spread)
+        T_camera_base = shifted(x * HAND_POSE_SIGMA)
     return T_camera_base
+
+
+def triangle_poses(camera: Camera, pins: Array, pixels: Array) -> Array:
+    """Poses (n, 4, 4), up to four, that bring three joints exactly to their pixels: those of n
+    joints that span the largest triangle in the image. None for fewer than three joints.
+
+    pins : (n, 3), base frame, m. pixels : (n, 2).
+    """
+    import cv2
+
+    rays = camera.ray(pixels)
+    triples = [
+        list(k) for k in combinations(range(len(pins)), 3) if (rays[list(k), 2] > LEAST_DEPTH).all()
+    ]
+    if not triples:
+        return np.empty((0, 4, 4))
+    plane = rays[..., :2] / rays[..., 2:]
+    widest = max(triples, key=lambda k: abs(np.linalg.det(plane[k[1:]] - plane[k[0]])))
+    _, turns, shifts = cv2.solveP3P(
+        pins[widest], plane[widest], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P
+    )
+    turn, shift = (np.array(part, dtype=float).reshape(-1, 3) for part in (turns, shifts))
+    return pose(rotation(turn), shift)
 
 
 def _motion(T_camera_base: Array, points: Array) -> Callable[[Array], Array]:

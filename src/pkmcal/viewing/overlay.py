@@ -31,6 +31,7 @@ from pkmcal.viewing.gestures import (
     farther,
     pinned,
     rolled,
+    triangle_poses,
     turned_as_ball,
 )
 from pkmcal.web.session_document import JointPixel, OverlayAnswer, Pin, ViewRequest
@@ -98,10 +99,8 @@ def placed_by_hand(content: SessionContent, request: ViewRequest) -> Pane:
         T_camera_base = pane.T_camera_base
     camera, points = pane.camera, pane.points.reshape(-1, 3)
     # pinned joints first, then the gesture
-    joints = [pin for pin in request.pins if pin.end != "axis"]
-    if joints:
-        ends = np.array([_place_on_leg(content, request, pin) for pin in joints])[:, 0]
-        pixels = np.array([pin.pixel for pin in joints], dtype=float)
+    ends, pixels = _pinned_joints(content, request)
+    if len(ends):
         T_camera_base = pinned(camera, T_camera_base, points, ends, pixels)
     if request.gesture is not None:
         start, end = (
@@ -118,6 +117,26 @@ def placed_by_hand(content: SessionContent, request: ViewRequest) -> Pane:
                 factor = float(request.gesture.factor)
                 T_camera_base = farther(camera, T_camera_base, points, start, factor)
     return replace(pane, T_camera_base=T_camera_base)
+
+
+def poses_by_pins(content: SessionContent, request: ViewRequest) -> Array:
+    """Poses (n, 4, 4), none to four, that bring three or more pinned joints to their pixels."""
+    pane = pane_of(content, request)
+    ends, pixels = _pinned_joints(content, request)
+    points = pane.points.reshape(-1, 3)
+    poses = triangle_poses(pane.camera, ends, pixels)
+    pinned_poses = [pinned(pane.camera, T, points, ends, pixels) for T in poses]
+    return np.array(pinned_poses).reshape(-1, 4, 4)
+
+
+def _pinned_joints(content: SessionContent, request: ViewRequest) -> tuple[Array, Array]:
+    """Pinned joints (n, 3), base frame, m, in the configuration of each one's image, and their
+    pixels (n, 2).
+    """
+    joints = [pin for pin in request.pins if pin.end != "axis"]
+    ends = [_place_on_leg(content, request, pin)[0] for pin in joints]
+    pixels = [pin.pixel for pin in joints]
+    return np.array(ends).reshape(-1, 3), np.array(pixels, dtype=float).reshape(-1, 2)
 
 
 def place_of(T_camera_base: Array) -> dict[str, list[float]]:
