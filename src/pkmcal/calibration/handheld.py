@@ -402,7 +402,7 @@ class _CachedHypotheses:
     scores : by the joint estimate, None before it.
     by : marginal prior of the machine at that time, None for the nominal model.
     beside : number of images that determined the machine.
-    beside_neighbours : whether poses by the background of single neighbours have been tried.
+    by_neighbours : whether poses by the background of single neighbours have been tried.
     anew : whether ``hypotheses`` are by a machine from images.
     """
 
@@ -411,7 +411,7 @@ class _CachedHypotheses:
     scores: ScoredPoses | None = None
     by: MarginalPrior | None = None
     beside: int = 0
-    beside_neighbours: bool = False
+    by_neighbours: bool = False
     anew: bool = False
 
 
@@ -514,7 +514,7 @@ def _search(
     p, scene, placed, k = image.decoded(), so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
     by_neighbours = scene.prior is not None and before.scores is not None
-    anew = before.anew or before.beside_neighbours
+    anew = before.anew or before.by_neighbours
     if anew and not before.anew:
         alone = _image_hypotheses(session, scene, p, _OPTIONS.wider)
     elif (
