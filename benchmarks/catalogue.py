@@ -5,10 +5,10 @@
 
 Each session is simulated with its own machine, rendered, and divided: calibrate and calibrate
 --holdout get the first configurations, validate and watch five each of the others. For each machine
-and kind of image, and each command: sessions in which it works, is refused, or is accepted and
-wrong; then the findings, with their codes, of all that are not plain acceptances. Wrong is a tool
-that is off by more than three of its stated standard deviations, and for watch a change that it
-claims.
+and kind of image, and each command: sessions in which it works, asks for more configurations, is
+refused, or is accepted and wrong; then the findings, with their codes, of all that are not plain
+acceptances. Wrong is a tool that is off by more than three of its stated standard deviations, and
+for watch a change that it claims.
 """
 
 from __future__ import annotations
@@ -34,12 +34,14 @@ STATIONS = {"legs": (2, (640, 480)), "board": (1, (1280, 960))}
 """Stations of a kind of image, and the images' size."""
 NOISE = 1e-5
 """m or rad, of a reading."""
+TOO_FEW = ("watch.leg_weak", "watch.leg_blind")
+"""Findings by which a watch asks for more configurations, as its page says how many may."""
 FAR = 3.0
 """Stated standard deviations beyond which an error is not to be accepted."""
 
 
 class Answer(NamedTuple):
-    """A command's answer: works, refused or wrong; codes of its warnings and errors."""
+    """A command's answer: works, asks for more, refused or wrong; codes of warnings and errors."""
 
     word: str
     codes: tuple[str, ...]
@@ -74,11 +76,12 @@ def answer(run: Callable[[], Any], wrong: Callable[[Any], bool]) -> tuple[Answer
 
     try:
         result = run()
+        codes = tuple(f.code for f in result.findings if f.level != "note")
     except PkmcalError as error:
         return Answer("refused", (f"{type(error).__name__}: {error}",)), None
-    codes = tuple(f.code for f in result.findings if f.level != "note")
     if result.exit_code:
-        return Answer("refused", codes), result
+        more = bool(codes) and all(code.startswith(TOO_FEW) for code in codes)
+        return Answer("asks for more" if more else "refused", codes), result
     return Answer("wrong" if wrong(result) else "works", codes), result
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from faults import raises
 from pkmcal.boards.board import chessboard, load_board
-from pkmcal.boards.circles import circle_centres, find_circles
+from pkmcal.boards.circles import circle_centres
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.find import (
     Markers,
@@ -19,6 +19,7 @@ from pkmcal.boards.find import (
     dictionary,
     marker_outlines,
 )
+from pkmcal.boards.lattice import lattices
 from pkmcal.boards.layout import another_grid, marker_layout
 from pkmcal.boards.prints import Print
 from pkmcal.boards.saddles import SaddleOptions, largest_block, saddles
@@ -399,7 +400,9 @@ def test_a_circles_centre_is_not_its_images_centroid(tmp_path):
     T_camera_board = view(board, (0.0, 0.9, 0.0), (0.0, 0.0), 0.42)
     image = render(CAMERAS["pinhole"], T_camera_board, board)
     truth = CAMERAS["pinhole"].project(apply(T_camera_board, board.points))
-    rough = find_circles(image, board)
+    found, rough = cv2.findCirclesGrid(image, board.counts)
+    assert found
+    rough = rough.reshape(-1, 2)
     centres, good, _ = circle_centres(image, board, rough)
     assert good.all()
     assert np.sqrt(np.mean((rough - truth) ** 2)) > 0.1
@@ -508,6 +511,18 @@ def test_a_grid_of_kalibr_described_as_one_that_runs_to_the_right(tmp_path):
     assert "ids go on by -1 to the right and by +5 downward" in caught.value.found
 
 
+def test_a_border_of_another_width(tmp_path):
+    """Kalibr's tags, described as OpenCV prints them."""
+    board = board_of(tmp_path, FILES["kalibr_aprilgrid"])
+    image = render(CAMERAS["pinhole"], view(board, *VIEWS["kalibr_aprilgrid", "pinhole"]), board)
+    cv2.imwrite(str(tmp_path / "tags.png"), image)
+    other = board_of(tmp_path, yaml_text({**board.document, "border": 1}))
+    with pytest.raises(InputError) as caught:
+        detect_boards([tmp_path / "tags.png"], other)
+    assert caught.value.code == "board.another"
+    assert caught.value.found.endswith("of DICT_APRILTAG_36h11 with border: 2")
+
+
 def test_two_boards_mixed(pictures):
     """A minority of images with another board is not used, with the reason; a majority refused."""
     board, paths = pictures["charuco"]
@@ -613,18 +628,48 @@ def test_a_marker_with_two_dark_bits():
     assert len(marker_outlines(image)) > 0
 
 
-@pytest.mark.parametrize("pitch", [20, 60])
-def test_windows_are_no_circles(tmp_path, pitch):
-    """Sharp dark squares on the places of circles."""
+def windows(pitch, sides=(1.0, 1.0)):
+    """Image of 8 x 6 sharp dark rectangles, of half the pitch times ``sides``, x and y."""
     image = np.full((480, 640), 200, np.uint8)
+    half = np.rint(0.28 * pitch * np.array(sides)).astype(int)
     for row, column in np.ndindex(6, 8):
         y, x = 60 + pitch * row, 80 + pitch * column
-        half = round(0.28 * pitch)
-        image[y - half : y + half, x - half : x + half] = 40
+        image[y - half[1] : y + half[1], x - half[0] : x + half[0]] = 40
+    return image
+
+
+@pytest.mark.parametrize(
+    ("pitch", "sides", "blur"),
+    [
+        (20, (1.0, 1.0), 0.0),
+        (60, (1.0, 1.0), 0.0),
+        # as a circle, a blurred square and a rectangle have little of the fourth harmonic
+        (12, (1.0, 1.0), 1.2),
+        (60, (1.2, 0.8), 0.0),
+    ],
+)
+def test_windows_are_no_circles(tmp_path, pitch, sides, blur):
+    """Dark rectangles on the places of circles."""
+    image = windows(pitch, sides)
+    image = cv2.GaussianBlur(image, (0, 0), blur) if blur else image
     cv2.imwrite(str(tmp_path / "windows.png"), image)
     with pytest.raises(InputError) as caught:
         detect_boards([tmp_path / "windows.png"], board_of(tmp_path, FILES["circle_grid"]))
     assert caught.value.found == "only 0 of 48 corners are sharp and uncovered"
+
+
+def test_windows_beside_a_board_do_not_hide_it(tmp_path):
+    """OpenCV's detector finds the dark windows first, light circles last."""
+    board = board_of(tmp_path, FILES["circle_grid"])
+    image = np.full((480, 640), 200, np.uint8)
+    image[:240, :320] = cv2.resize(windows(60), (320, 240), interpolation=cv2.INTER_AREA)
+    image[240:, 320:] = 30
+    truth = np.array([(350 + 35 * c, 265 + 35 * r) for r, c in np.ndindex(6, 8)])
+    for x, y in truth.tolist():
+        cv2.circle(image, (x, y), 11, 220, -1, cv2.LINE_AA)
+    detection = detect_board(cv2.GaussianBlur(image, (0, 0), 0.8), board)
+    np.testing.assert_array_equal(detection.ids, np.arange(48))
+    np.testing.assert_allclose(detection.pixels, truth, atol=0.02)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5000), (5000, 1), (2, 3000), (20, 20)])
@@ -698,3 +743,68 @@ def test_points_stand_where_opencv_has_them(tmp_path):
     words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     theirs = cv2.aruco.GridBoard((5, 4), 0.04, 0.012, words).getObjPoints()
     np.testing.assert_allclose(grid.points, np.asarray(theirs).reshape(-1, 3), atol=1e-7)
+
+
+def discs(columns, rows, without=(), pitch=34, shift=0):
+    """Image of dark discs in rows, every second one shifted; places (rows, columns, 2) px."""
+    image = np.full((pitch * (rows + 3), pitch * (columns + 4)), 210, np.uint8)
+    row, column = np.mgrid[:rows, :columns]
+    places = np.stack([pitch * (column + 2) + shift * (row % 2), pitch * (row + 2)], axis=-1)
+    for at in np.ndindex(rows, columns):
+        if at not in without:
+            cv2.circle(image, tuple(places[at].tolist()), 10, 40, -1, cv2.LINE_AA)
+    turn = cv2.getRotationMatrix2D((image.shape[1] / 2, image.shape[0] / 2), 7.0, 0.9)
+    image = cv2.warpAffine(image, turn, image.shape[::-1], borderValue=210)
+    return cv2.GaussianBlur(image, (0, 0), 0.8), places @ turn[:, :2].T + turn[:, 2]
+
+
+@pytest.mark.parametrize(
+    ("described", "shift"),
+    [
+        ("type: chessboard\ncorners: [8, 5]\nsquare: 0.03\n", 0),
+        ("type: circle_grid\ncircles: [7, 6]\nspacing: 0.02\n", 0),
+        (FILES["circle_grid_asymmetric"], 17),
+    ],
+)
+def test_discs_everywhere_are_no_board(tmp_path, described, shift):
+    """A grid of circles has only its counts: a part of a larger one is none."""
+    cv2.imwrite(str(tmp_path / "discs.png"), discs(20, 14, shift=shift)[0])
+    with pytest.raises(InputError) as caught:
+        detect_boards([tmp_path / "discs.png"], board_of(tmp_path, described))
+    assert caught.value.code == "board.not_found"
+
+
+def test_a_grid_of_other_counts(tmp_path):
+    cv2.imwrite(str(tmp_path / "discs.png"), discs(8, 6)[0])
+    board = board_of(tmp_path, "type: circle_grid\ncircles: [7, 6]\nspacing: 0.02\n")
+    with raises(InputError, code="board.not_found", found="a lattice of 8x6 circles"):
+        detect_boards([tmp_path / "discs.png"], board)
+
+
+def test_circles_that_are_covered(tmp_path):
+    """Single circles may be; of a grid without its first column, nobody knows which column is."""
+    board = board_of(tmp_path, "type: circle_grid\ncircles: [7, 6]\nspacing: 0.02\n")
+    image, places = discs(7, 6, {(0, 0), (2, 3), (5, 6)})
+    detection = detect_board(image, board)
+    assert set(range(42)) - set(detection.ids.tolist()) == {0, 17, 41}
+    np.testing.assert_allclose(detection.pixels, places.reshape(-1, 2)[detection.ids], atol=0.05)
+    assert not detect_board(discs(6, 6)[0], board).success
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1.1])
+def test_lattices_keep_their_steps(tilt):
+    """Points of a plane at a large tilt, shuffled, with others beside them."""
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[:9, :7].reshape(2, -1)
+    x, y = column - 3.0, (row - 4.0) * np.cos(tilt)
+    grid = np.stack([x, y], axis=-1) * 500 / (14 + (row - 4.0) * np.sin(tilt))[:, None]
+    beside = rng.uniform((150, -200), (300, 200), (40, 2))
+    order = rng.permutation(len(grid) + len(beside))
+    first, *_ = lattices(np.concatenate([grid, beside])[order])
+    mine = order[first.points] < len(grid)
+    assert mine.sum() == len(grid)
+    cells, number = first.cells[mine], order[first.points[mine]]
+    true = np.stack([column, row], axis=-1)[number]
+    steps = np.linalg.lstsq(true - true.mean(axis=0), cells - cells.mean(axis=0), rcond=None)[0]
+    np.testing.assert_allclose(np.abs(np.linalg.det(steps)), 1.0, atol=1e-9)
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)

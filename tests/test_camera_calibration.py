@@ -414,6 +414,20 @@ def test_no_model_wins_by_giving_up_more():
     assert is_worse(offset, best)
 
 
+@pytest.mark.parametrize(("ratio", "sure"), [(1.3, True), (1.5, False)])
+def test_a_focal_length_that_the_views_do_not_determine(ratio, sure):
+    """Such a model is chosen only if the others leave out more than the noise."""
+    true = TRUE["pinhole"]
+    views = views_of(detections(true, poses_for(true, 10, 1), 2), BOARD)
+    best = best_of(camera_candidates(views, SIZE, ("pinhole",)))
+    assert 0 < best.focal_share < 0.005
+    unsure = replace(best, focal_share=0.16)
+    other = replace(best, robust=ratio * best.robust, by_view=ratio**2 * best.by_view)
+    assert is_worse(other, unsure)
+    assert best_of((unsure, other)) is (other if sure else unsure)
+    assert best_of((unsure,)) is unsure
+
+
 @ONE_MODEL
 def test_single_bad_corners_do_no_harm(true):
     calibration = calibrate_camera(

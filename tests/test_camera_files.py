@@ -591,3 +591,69 @@ def test_a_transposed_matrix(tmp_path):
             tmp_path, ROS.replace("0, 320, 0, 501, 240, 0, 0, 1", "0, 0, 0, 501, 0, 320, 240, 1")
         )
     assert error.value.found == "[500.0, 0.0, 0.0, 0.0, 501.0, 0.0, 320.0, 240.0, 1.0]"
+
+
+MESSAGE = (
+    "header:\n  seq: 5\n  frame_id: camera\nheight: 480\nwidth: 640\n"
+    "distortion_model: plumb_bob\nD: [0.1, -0.2, 0.001, 0.002, 0.0]\n"
+    "K: [610.5, 0.0, 320.1, 0.0, 610.2, 240.7, 0.0, 0.0, 1.0]\n"
+    "R: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]\n"
+    "P: [610.5, 0.0, 320.1, 0.0, 0.0, 610.2, 240.7, 0.0, 0.0, 0.0, 1.0, 0.0]\n"
+    "binning_x: 0\nbinning_y: 0\n"
+    "roi:\n  x_offset: 0\n  y_offset: 0\n  height: 0\n  width: 0\n  do_rectify: False\n"
+)
+"""Message of ROS 1, as ``rostopic echo`` prints it."""
+
+
+@pytest.mark.parametrize("ros2", [False, True])
+@pytest.mark.parametrize("messages", [1, 2])
+def test_printed_messages_of_ros(tmp_path, ros2, messages):
+    text = re.sub(r"^([DKRP]):", lambda m: m[0].lower(), MESSAGE, flags=re.MULTILINE)
+    path = tmp_path / "info.yaml"
+    path.write_text(((text if ros2 else MESSAGE) + "---\n") * messages)
+    camera = load_camera(path)
+    assert camera.image_size == (640, 480)
+    expected = [610.5, 610.2, 320.1, 240.7, 0.1, -0.2, 0.001, 0.002, 0.0]
+    np.testing.assert_array_equal(camera.parameters, expected)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("x_offset: 0", "x_offset: 64"), ("binning_y: 0", "binning_y: 2")]
+)
+def test_a_ros_message_about_a_part_of_the_sensor(tmp_path, old, new):
+    (tmp_path / "info.yaml").write_text(MESSAGE.replace(old, new))
+    with raises(InputError, code="camera.region"):
+        load_camera(tmp_path / "info.yaml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "gyroscope_noise_density: 1.87e-04\nrostopic: /imu0\nupdate_rate: 200.0\n",
+        "imu0:\n  gyroscope_noise_density: 1.87e-04\n  update_rate: 200.0\n",
+        "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n",
+    ],
+)
+def test_other_files_of_kalibr(tmp_path, text):
+    (tmp_path / "file.yaml").write_text(text)
+    with raises(InputError, code="camera.other_file"):
+        load_camera(tmp_path / "file.yaml")
+
+
+@pytest.mark.parametrize("without", ["camera_model", "intrinsics", "resolution"])
+def test_a_camera_of_kalibr_without_a_field(tmp_path, without):
+    camera = camera_of("extended_unified")
+    text = foreign_text(camera, tmp_path / "chain.yaml", "kalibr")
+    rest = re.sub(rf"^  {without}:.*?(?=^  \w|\Z)", "", text, flags=re.MULTILINE | re.DOTALL)
+    (tmp_path / "chain.yaml").write_text(rest)
+    with pytest.raises(InputError) as caught:
+        load_camera(tmp_path / "chain.yaml")
+    assert f"cam0.{without}" in str(caught.value.where)
+
+
+def test_an_opencv_file_without_known_distortion(tmp_path):
+    """Coefficients under another name are not taken for a lens without any."""
+    text = foreign_text(camera_of("pinhole"), tmp_path / "camera.yaml", "opencv")
+    (tmp_path / "camera.yaml").write_text(text.replace("distortion_coefficients", "dist"))
+    with raises(InputError, expected="distortion_coefficients"):
+        load_camera(tmp_path / "camera.yaml")

@@ -267,6 +267,23 @@ def test_numberings_that_nothing_distinguishes(name, firsts):
             assert equal_numberings(machine.with_values(values), joints) == ()
 
 
+@pytest.mark.parametrize(("about", "degrees", "near"), [("x", 5, False), ("z", 82, True)])
+def test_another_assembly_mode_nearby_is_named(demo, about, degrees, near):
+    """The mirror image below the base is turned by 10 degrees, but far away; the pose beyond
+    Fichter's singularity, a quarter turn about the vertical, by 16.
+    """
+    session = load_session(demo.session)
+    turned = pose(rotation(np.radians(degrees) * np.eye(3)["xyz".index(about)]), np.zeros(3))
+    joints = session.joints.copy()
+    joints[0] = session.machine.inverse(session.machine.home() @ turned)
+    session = replace(session, joints=joints)
+    findings = _kinematics(session, np.random.default_rng(0)).findings
+    named = [f for f in findings if f.code == "configurations.other_assembly"]
+    assert len(named) == near
+    for finding in named:
+        assert finding.facts["turn"] == pytest.approx(np.radians(16), rel=0.2)
+
+
 def test_nearly_singular_configurations_are_named(demo):
     """The fourth one a degree from Fichter's singularity, a quarter turn about the vertical."""
     session = load_session(demo.session)

@@ -234,6 +234,27 @@ def test_five_images_of_a_board_predict_as_well_as_stated():
     assert 0.025 < chdtr(dof, chi2) < 0.975
 
 
+@pytest.mark.parametrize(("seed", "spread", "n"), [(0, 0.04, 19), (1, 0.08, 19), (2, 0.04, 12)])
+def test_a_board_on_a_platform_that_does_not_turn(seed, spread, n):
+    """Readings as soft as elsewhere let board and camera slide along a curved valley."""
+    rng = np.random.default_rng(seed)
+    nominal = load_mechanism("3-upu")
+    true = true_machine(nominal, 1.0, rng)
+    poses = np.tile(true.home(), (n, 1, 1))
+    poses[:, :3, 3] += rng.uniform(-spread, spread, (n, 3))
+    data = measured(true, poses, rng, noise=0.03).measurements
+    data = replace(
+        data, poses=replace(data.poses, whiten=data.poses.whiten / 0.03), joint_noise=1e-5
+    )
+    start = start_state(nominal, data, T_CAMERA_BASE[None])
+    estimate = bundle(nominal, data, start)
+    value = predict(estimate.machine, data, estimate.state)
+    assert value.observed.all()
+    stated = np.sqrt(np.diag(value.noise)).reshape(n, 3)
+    assert np.abs(value.errors.residuals / stated).max() < 5
+    assert np.sqrt(np.mean(value.errors.residuals**2)) < 5e-5
+
+
 # verdicts
 
 

@@ -94,10 +94,12 @@ def detect_boards(
     size = _common_size(files)
     with ThreadPoolExecutor(THREADS) as pool:
         detections: list[Detection] = []
-        for detection in pool.map(
+        blocks: list[int | None] = []
+        for detection, block in pool.map(
             lambda path: _detect_in_file(path, size, board, options.detection, quick=True), files
         ):
             detections.append(detection)
+            blocks.append(block)
             done = len(detections)
             progress(f"Detecting the board: {done} of {len(files)} images", done / len(files) / 2)
         if not any(detection.success for detection in detections):
@@ -106,9 +108,12 @@ def detect_boards(
         missed = [k for k, detection in enumerate(detections) if not detection.success]
         missed = missed if board.type == "chessboard" else []  # markers have no slow method
         again = pool.map(
-            lambda k: _detect_in_file(files[k], size, board, options.detection, quick=False), missed
+            lambda k: _detect_in_file(
+                files[k], size, board, options.detection, quick=False, block=blocks[k]
+            ),
+            missed,
         )
-        for done, (k, detection) in enumerate(zip(missed, again, strict=True), start=1):
+        for done, (k, (detection, _)) in enumerate(zip(missed, again, strict=True), start=1):
             detections[k] = detection
             text = f"Searching the rest for the board: {done} of {len(missed)} images"
             progress(text, (1 + done / len(missed)) / 2)
@@ -117,10 +122,19 @@ def detect_boards(
 
 
 def _detect_in_file(
-    path: Path, size: tuple[int, int], board: Board, options: BoardDetectionOptions, *, quick: bool
-) -> Detection:
-    """Detection in one image file."""
-    return detect_board(decode(path, size, path.name), board, path.name, quick, options)
+    path: Path,
+    size: tuple[int, int],
+    board: Board,
+    options: BoardDetectionOptions,
+    *,
+    quick: bool,
+    block: int | None = None,
+) -> tuple[Detection, int | None]:
+    """Detection in one image file, and the image's `largest_block` for a chessboard."""
+    image = decode(path, size, path.name)
+    if board.type == "chessboard" and block is None:
+        block = largest_block(narrowed(image, options.searched_width)[0])
+    return detect_board(image, board, path.name, quick, options, block), block
 
 
 def _common_size(files: Sequence[Path]) -> tuple[int, int]:
@@ -169,7 +183,7 @@ def check_boards(
         if board.type == "chessboard":
             other = _larger_chessboard(image, board, options)
         elif board.type == "circle_grid":
-            other = None  # of another grid, the detector finds no part
+            other = None  # a lattice that goes on beyond the grid is no detection
         else:
             markers = _own_markers(image, board)
             other = _markers_beyond(image, board, markers, options)
@@ -339,6 +353,14 @@ def other_board(
         best = _other_charuco(image, board, detect_markers(image, dictionary(name)), options)
         if best:
             return best
+    if board.type == "aruco_grid":
+        # the same markers with a border of another width, as Kalibr's differ from OpenCV's
+        border = 3 - board.document.get("border", 1)
+        own = dictionary(name, board.document.get("first_id", 0), board.counts[0] * board.counts[1])
+        small, _ = narrowed(image, options.detection.searched_width)
+        count = len(detect_markers(small, own, border=border).ids)
+        if count >= options.least_markers:
+            return f"{count} markers of {name} with border: {border}"
     return _other_markers(image, name, options) or _other_chessboard(
         image, (0, 0), part=True, options=options
     )
@@ -393,7 +415,9 @@ def _other_chessboard(
             continue
         if not part and all(n <= m for n, m in zip(sorted(candidate), sorted(counts), strict=True)):
             continue
-        if block < options.visible_share * (candidate[0] - 2) * (candidate[1] - 2):
+        # blocks of a part of the candidate, or of a pattern that goes on far beyond it
+        middles = (candidate[0] - 2) * (candidate[1] - 2)
+        if not options.visible_share * middles <= block <= middles / options.visible_share:
             continue
         if _all_corners(image, candidate, options.detection, block):
             return chessboard(candidate, 1.0).described

@@ -15,7 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.board import Board, Detection
-from pkmcal.boards.circles import circle_centres, find_circles
+from pkmcal.boards.circles import Circles, find_circles
 from pkmcal.boards.corner_fit import (
     CORNER_FIT_OPTIONS,
     CornerFitOptions,
@@ -86,28 +86,32 @@ def detect_board(
     name: str = "",
     quick: bool = False,
     options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS,
+    block: int | None = None,
 ) -> Detection:
     """Find the board's corners in one image, grey levels (height, width) uint8.
 
-    quick : only the first way of finding a chessboard.
+    quick : only the first way of finding a chessboard. block : the image's `largest_block`, None if
+        it is not known yet.
     """
     mirrored, why = False, ""
+    circles: Circles | None = None
     if board.type == "charuco":
         raw, mirrored, why = _charuco(image, board, options)
     elif board.type == "aruco_grid":
         raw, mirrored, why = _marker_grid(image, board, options)
     else:
         if board.type == "chessboard":
-            pixels = find_chessboard(image, board.counts, quick, options=options)
+            pixels = find_chessboard(image, board.counts, quick, block, options)
             why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners"
         else:
-            pixels, why = find_circles(image, board), f"no grid like {board.described}"
+            circles, why = find_circles(image, board)
+            pixels = None if circles is None else circles.pixels
         raw = NO_CORNERS if pixels is None else (np.arange(len(pixels)), pixels)
     size = (image.shape[1], image.shape[0])
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     if len(raw[0]) < options.least_corners:
         return Detection(name, size, *nothing, reason=why)
-    fitted = _fitted(image, board, raw, options)
+    fitted = _fitted(image, board, raw, options) if circles is None else circles
     ids, good = raw[0], fitted.good
     weak = tuple(int(i) for i in ids[~good])
     least = (
@@ -394,9 +398,6 @@ def _fitted(image: Integers, board: Board, raw: Raw, options: BoardDetectionOpti
     """The corners' fits; a grid of markers may have plain corners or touching dark squares."""
     ids, pixels = raw
     data = board.document
-    if board.type == "circle_grid":
-        centres, good, sigma = circle_centres(image, board, pixels)
-        return Corners(centres, good, sigma, np.zeros((len(ids), 7)))
     if board.type == "aruco_grid":
         module = 1 / (marker_bits(data["dictionary"]) + 2 * data.get("border", 1))
         reach = min(options.corner.reach, 0.8 * data["gap"] / data["marker"])

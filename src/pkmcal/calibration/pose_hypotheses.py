@@ -37,7 +37,13 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, Purpose
-from pkmcal.identify.hand_eye import closed_forms, start_from_poses
+from pkmcal.identify.hand_eye import (
+    Pair,
+    PairProblem,
+    closed_forms,
+    size_of,
+    start_from_poses,
+)
 from pkmcal.identify.length_registration import determines_legs, register_by_lengths
 from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.state import State
@@ -64,12 +70,17 @@ from pkmcal.outcome.hypotheses import (
 )
 from pkmcal.session.load import Session
 from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
+from pkmcal.solver.search import minimise
 
 EXPLAINED_POSES_SHARE = NEARLY_ALL
 """Share of the poses that a hypothesis has to explain; the rest may be outliers."""
 HOPELESS_POSE_SCALE = 50.0
 """Factor on the poses' noise above which an estimate under a hypothesis is abandoned after a first
 search: far above ``VerdictOptions.too_noisy``."""
+
+REGISTRATION_TOLERANCE = 0.1
+"""Last step of a registration, as STEP_TOLERANCE, in stated standard deviations of the poses: a
+tenth of their noise, where misfits are compared that exceed it."""
 
 
 @dataclass(frozen=True)
@@ -413,34 +424,40 @@ def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
             own = np.flatnonzero((poses.station == s) & (poses.mount == m))
             at = poses.configuration[own]
             if machine.layout.underdetermined and determines_legs(poses.select(own)):
-                laid = register_by_lengths(
+                each = register_by_lengths(
                     machine, joints[group][:, at], observed[:, own], poses.whiten[own],
                     cases[0].joint_noise,
                 ).squares  # fmt: skip
             else:
-                laid = _laid(body[group][:, at], observed[:, own], poses.whiten[own])
-            squares.append(laid)
+                each = _registered_squares(
+                    body[group][:, at], observed[:, own], poses.whiten[own], size_of(machine)
+                )
+            squares.append(each)
         if squares:
             out[group] = _usual(np.concatenate(squares, axis=1))
     return out
 
 
-def _laid(body: Array, observed: Array, whiten: Array) -> Array:
-    """Mean squares (N, n) of the whitened residuals of N runs of n poses of one station and mount,
-    by the closed form with the smallest residuals.
+def _registered_squares(body: Array, observed: Array, whiten: Array, size: float) -> Array:
+    """Mean squares (N, n) of the whitened residuals of N runs of n poses of one station and mount.
+
+    The closed form with the smallest residuals is where least squares start: a nominal error of the
+    rotations, which closed forms solve first, displaces their positions.
 
     body : T_base_platform (N, n, 4, 4).
     observed : T_station_target (N, n, 4, 4).
     whiten : (n, 6, 6).
+    size : the limbs' length, m.
     """
-    squares: list[Array] = []
-    for pair in closed_forms(body, observed):
-        predicted = pair.T_camera_base[:, None] @ body @ pair.T_mount[:, None]
-        error = (whiten @ pose_difference(predicted, observed)[..., None])[..., 0]
-        squares.append(np.mean(error**2, axis=-1))
-    each = np.stack(squares)
+    problem = PairProblem(body, observed, np.ones(body.shape[:2]), whiten, size)
+    starts = closed_forms(body, observed)
+    each = np.stack([np.mean(problem.differences(pair) ** 2, axis=-1) for pair in starts])
     best = _usual(each.reshape(-1, each.shape[-1])).reshape(each.shape[:2]).argmin(axis=0)
-    return each[best, np.arange(each.shape[1])]
+    every = Pair(
+        *(np.stack(parts)[best, np.arange(len(body))] for parts in zip(*starts, strict=True))
+    )
+    pair = minimise(problem, every, tolerance=REGISTRATION_TOLERANCE).state
+    return np.mean(problem.differences(pair) ** 2, axis=-1)
 
 
 def nominal_misfit(

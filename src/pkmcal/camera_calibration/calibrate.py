@@ -75,10 +75,6 @@ class CalibrationCheckOptions:
     # ratio of held-out errors above which a model named by the user is refused; a smaller
     # significant ratio gives a warning
     unfit_ratio: float = UNEXPLAINED_SCALE
-    # largest standard deviation of the focal length, as a share of it; a machine of 1 m would be
-    # off by 2 cm. In the same simulation, 3 images tilted by at most 7.5 degrees have 1.7 %, in the
-    # worst case 2.7 %; all images tilted by 15 degrees or more have less than half of the limit
-    least_sure: float = 0.02
     # largest share of rejected corners. Their noise is estimated from the better half of all
     # corners, which does not represent the rest if its errors are of another kind. Not checked
     # within a factor of two
@@ -489,7 +485,7 @@ def check_determined(
     else:
         sigma = np.sqrt(np.diag(covariance))[mine]
     share = float(np.max(sigma / fit.camera.parameters[mine]))
-    if share <= options.least_sure and np.isfinite(share):
+    if share <= options.selection.least_sure and np.isfinite(share):
         return
     tilt = tilts(fit.T_camera_board, views.points)
     raise ResultError(

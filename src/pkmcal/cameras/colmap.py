@@ -45,7 +45,7 @@ _MODELS = {
 def is_colmap(text: str) -> bool:
     """Whether a text is COLMAP's cameras.txt."""
     first = next(iter(_lines(text)), "")
-    return _LINE.fullmatch(first) is not None
+    return _LINE.fullmatch(first) is not None or "CAMERA_ID, MODEL, WIDTH, HEIGHT" in text
 
 
 def read_colmap(text: str, label: str, name: str | None) -> Intrinsics:

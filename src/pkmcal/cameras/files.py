@@ -71,6 +71,8 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
         raise _without_names(label, camera)
     if "camera_matrix" in document.data:
         return _from_ros(document)
+    if _is_ros_message(document.data):
+        return _from_ros(_camera_info_file(document))
     return camera_from_document(document)
 
 
@@ -86,16 +88,19 @@ def is_camera_file(path: Path | str) -> bool:
         return False
     data = parse_yaml(text, path, path.name).data
     own = data.get("model") in camera_models()
-    return own or "camera_matrix" in data or bool(_kalibr_names(data))
+    ros = "camera_matrix" in data or _is_ros_message(data)
+    return own or ros or bool(_kalibr_names(data))
 
 
 def _text_of(path: Path, label: str) -> str:
-    """Text of a camera file; OpenCV's first line, no YAML, is a comment in files of Kalibr, to
-    which OpenVINS adds it.
+    """Text of a camera file; of several ROS messages the first. OpenCV's first line, no YAML, is a
+    comment in files of Kalibr, to which OpenVINS adds it.
     """
     text = read_text(path, label, LARGEST_WRITTEN_FILE)
     if text.startswith("%YAML:1.0") and "opencv-matrix" not in text and "camera_model:" in text:
         return text.replace("%", "#", 1)
+    if "distortion_model:" in text and re.search(r"^[kK]:", text, re.MULTILINE):
+        return re.split(r"^---\s*$", text.removeprefix("---"), maxsplit=1, flags=re.MULTILINE)[0]
     return text
 
 
@@ -106,7 +111,12 @@ def _is_opencv(text: str) -> bool:
 
 def _kalibr_names(data: Mapping[str, Any]) -> list[str]:
     """Names of the cameras in Kalibr's format."""
-    return [key for key, one in data.items() if isinstance(one, dict) and "camera_model" in one]
+    return [
+        key
+        for key, one in data.items()
+        if isinstance(one, dict)
+        and ("camera_model" in one or {"intrinsics", "resolution"} <= one.keys())
+    ]
 
 
 def _without_names(label: str, camera: str) -> InputError:
@@ -136,6 +146,7 @@ def camera_path(path: Path | str) -> tuple[Path, str | None]:
 
 def camera_from_document(document: Document) -> Camera:
     """Camera from a document in pkmcal's format, validated; raises InputError."""
+    _check_kind(document)
     models = camera_models()
     name = document.data.get("model")
     if not isinstance(name, str) or name not in models:
@@ -165,6 +176,26 @@ def camera_from_document(document: Document) -> Camera:
         return camera
     where = document.where("covariance")
     return replace(camera, covariance=_checked_covariance(fields.covariance, camera, where))
+
+
+def _check_kind(document: Document) -> None:
+    """Raise `InputError` for files of Kalibr that describe something other than a camera."""
+    parts = [document.data, *(one for one in document.data.values() if isinstance(one, dict))]
+    if any("gyroscope_noise_density" in part for part in parts):
+        kind, key = "an inertial sensor", "gyroscope_noise_density"
+    elif "target_type" in document.data:
+        kind, key = "a calibration board", "target_type"
+    else:
+        return
+    raise InputError(
+        f"the file describes {kind}, not a camera",
+        where=document.label,
+        found=key,
+        expected="cam0 with camera_model, intrinsics and resolution",
+        next_step="Name the file that Kalibr wrote of its cameras, camchain.yaml or"
+        " camchain-imucam.yaml",
+        code="camera.other_file",
+    )
 
 
 def _checked_covariance(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) -> Array:
@@ -290,16 +321,24 @@ def _from_opencv(text: str, label: str) -> Camera:
             not model_name.empty() and model_name.isString() and "fisheye" in model_name.string()
         )
         storage.release()
-    except (cv2.error, SystemError):  # SystemError: its constructor met invalid YAML
+    except (cv2.error, SystemError) as error:  # SystemError: its constructor met invalid YAML
+        fault = re.search(r"\((\d+)\): ([^'\n]+)", str(error.__cause__ or error))
         raise InputError(
             "not valid as OpenCV writes it",
-            where=label,
+            where=f"{label}, line {fault[1]}" if fault else label,
+            found=fault[2] if fault else None,
+            expected="a file of cv2.FileStorage",
             next_step="Write it again with cv2.FileStorage",
         ) from None
-    for key in ("matrix", "width", "height"):
+    for key in ("matrix", "width", "height", "distortion"):
         if numbers[key] is None:
             raise InputError(
-                f"the camera's {key} is missing", where=label, expected=_OPENCV_NAMES[key][0]
+                f"the camera's {key} is missing",
+                where=label,
+                expected=_OPENCV_NAMES[key][0],
+                next_step="Add it; a lens without distortion has five zeros"
+                if key == "distortion"
+                else "Add it, as cv2.FileStorage writes it",
             )
     for key, count in (("matrix", 9), ("width", 1), ("height", 1), ("xi", 1)):
         values = numbers[key]
@@ -311,8 +350,7 @@ def _from_opencv(text: str, label: str) -> Camera:
                 expected=count_of(count, "finite number"),
             )
     size = float(numbers["width"][0]), float(numbers["height"][0])
-    k = numbers["distortion"] if numbers["distortion"] is not None else np.zeros(0)
-    xi = numbers["xi"]
+    k, xi = numbers["distortion"], numbers["xi"]
     model = "unified" if xi is not None else "fisheye" if fisheye else _opencv_model(k)
     own = {} if xi is None else {"xi": float(xi[0])}
     _check_coefficients(k, f"{label}, {_OPENCV_NAMES['distortion'][0]}")
@@ -355,6 +393,42 @@ def _opencv_text(camera: Camera, xml: bool) -> str:
     if camera.model == "unified":
         storage.write("xi", np.array([[parameters["xi"]]]))
     return storage.releaseAndGetString()
+
+
+def _is_ros_message(data: Mapping[str, Any]) -> bool:
+    """Whether a document is a message of ROS's topic camera_info, printed by ``topic echo``."""
+    return {"width", "height", "distortion_model"} <= data.keys() and ("k" in data or "K" in data)
+
+
+def _camera_info_file(document: Document) -> Document:
+    """A printed camera_info message as the file that ROS's drivers write.
+
+    Raises InputError for a message about a part of the image or about binned pixels, whose numbers
+    are those of the whole image.
+    """
+    data = {key.lower() if len(key) == 1 else key: one for key, one in document.data.items()}
+    roi = data.get("roi")
+    part = roi if isinstance(roi, dict) else {}
+    shift = [part.get(key, 0) for key in ("x_offset", "y_offset")]
+    binning = [data.get(key, 0) for key in ("binning_x", "binning_y")]
+    if any(shift) or any(n not in (0, 1) for n in binning):
+        raise InputError(
+            "the images are a part of the sensor, or binned, and the camera's numbers are those of"
+            " the whole",
+            where=document.where("roi" if any(shift) else "binning_x"),
+            found=f"a shift of {quoted(shift)} and binning {quoted(binning)}",
+            expected="zeros",
+            next_step="Take whole images, or calibrate again from images of a board: pkmcal camera",
+            code="camera.region",
+        )
+    names = {
+        "k": "camera_matrix", "d": "distortion_coefficients", "r": "rectification_matrix",
+        "p": "projection_matrix",
+    }  # fmt: skip
+    file = {"distortion_model": data["distortion_model"]}
+    file |= {"image_width": data["width"], "image_height": data["height"]}
+    file |= {name: {"data": data[key]} for key, name in names.items() if key in data}
+    return replace(document, data=file, lines={})
 
 
 def _from_ros(document: Document) -> Camera:
@@ -478,7 +552,8 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
     """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
     key = named_entry({name: name for name in cameras}, wanted, document.label)
     data = document.data[key]
-    pair = (str(data["camera_model"]), str(data.get("distortion_model", "none")))
+    word = _value_at(document, (key, "camera_model"), "pinhole, omni, ds or eucm")
+    pair = (str(word), str(data.get("distortion_model", "none")))
     if pair not in _KALIBR:
         models = ["-".join(names) for names in _KALIBR]
         raise _unsupported(document.where(key, "camera_model"), "-".join(pair), models)
@@ -582,26 +657,28 @@ def _matrix(parameters: dict[str, float]) -> Array:
     )
 
 
-def _value_at(document: Document, keys: tuple[str | int, ...]) -> Any:
+def _value_at(document: Document, keys: tuple[str | int, ...], expected: str) -> Any:
     """Value under a path of keys; raises InputError if absent."""
     value: Any = document.data
     for key in keys:
         try:
             value = value[key]
         except (KeyError, IndexError, TypeError):
-            raise InputError("this is missing", where=document.where(*keys)) from None
+            raise InputError(
+                "this is missing", where=document.where(*keys), expected=expected
+            ) from None
     return value
 
 
 def _numbers_at(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -> Array:
     """List of numbers under a path of keys, as an array (n,) with n among ``counts``."""
-    values = _value_at(document, keys)
+    wanted = f"{counts[0]}" if len(counts) == 1 else f"up to {max(counts)}"
+    values = _value_at(document, keys, f"{wanted} numbers")
     numeric = isinstance(values, list) and all(
         isinstance(v, int | float) and not isinstance(v, bool) for v in values
     )
     if numeric and len(values) in counts:
         return np.array(values, dtype=float)
-    wanted = f"{counts[0]}" if len(counts) == 1 else f"up to {max(counts)}"
     raise InputError(
         "this is not the expected list of numbers",
         where=document.where(*keys),
@@ -616,7 +693,7 @@ def _size_at(
     """Image size (width, height) from two paths of keys, px."""
     out: list[int] = []
     for keys in (width, height):
-        value = _value_at(document, keys)
+        value = _value_at(document, keys, "a whole number of pixels")
         if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
             raise InputError(
                 "this is no size in pixels",

@@ -31,15 +31,24 @@ def is_mrcal(text: str) -> bool:
 
 def read_mrcal(text: str, label: str) -> Intrinsics:
     """Intrinsics of a .cameramodel file; raises InputError for lens models that pkmcal lacks."""
+    data, line, found = None, None, None
     try:
-        data = ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError, RecursionError, MemoryError):
-        data = None
+        tree = ast.parse(text.strip(), mode="eval")
+        # a word without quotes, such as nan
+        word = next((node for node in ast.walk(tree) if isinstance(node, ast.Name)), None)
+        line, found = (word.lineno, word.id) if word else (None, None)
+        data = ast.literal_eval(tree)
+    except SyntaxError as error:
+        line, found = error.lineno, error.text and error.text.strip()
+    except (ValueError, RecursionError, MemoryError):
+        pass  # the line is known, or the text is none of mrcal's
     if not isinstance(data, dict):
         raise InputError(
             "not valid as mrcal writes it",
-            where=label,
-            expected="a dictionary with lensmodel, intrinsics and imagersize",
+            where=f"{label}, line {line}" if line else label,
+            found=found and quoted(found),
+            expected="a dictionary with lensmodel, intrinsics and imagersize, numbers and texts in"
+            " quotes",
         )
     fields = {_text(key): value for key, value in data.items()}
     lens = _text(fields.get("lensmodel")).removeprefix(_PREFIX)

@@ -62,7 +62,7 @@ def _number(parent: Element, key: str, label: str) -> float:
     """Finite number of a child element; raises InputError."""
     text = parent.findtext(key)
     if text is None:
-        raise InputError("this is missing", where=f"{label}, {key}")
+        raise InputError("this is missing", where=f"{label}, {key}", expected="a number")
     try:
         value = float(text)
     except ValueError:

@@ -45,6 +45,7 @@ from pkmcal.checks.sentences import (
 )
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
+from pkmcal.identify.hand_eye import size_of
 from pkmcal.identify.verdict import misfit
 from pkmcal.judge.repeatability import require_repeats
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
@@ -62,6 +63,9 @@ from pkmcal.session.load import Session, Station, load_session
 from pkmcal.starter import untouched_files
 from pkmcal.wording import listed
 
+SAME_SOLUTION_SHARE = 0.01
+"""Distance of two assembly modes, relative to that of a near one, below which they are one solution
+of the forward kinematics."""
 BROKEN_IMAGES_NAMED = 10
 """Number of broken images of a station that are reported individually; the others are counted."""
 
@@ -224,11 +228,20 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematic
     weak = [session.configurations[k] for k in np.flatnonzero(fk.singularity < NEAR_SINGULAR)]
     if weak:
         findings.append(doubtful("configurations.singular_readings", listed(weak), names=weak))
-    turns = np.linalg.norm(pose_difference(modes, poses[0])[:, :3], axis=-1)
-    if np.any((turns > 1e-3) & (turns < SAME_POSE_TURN)):
-        turn = float(np.rad2deg(turns[turns > 1e-3].min()))
-        first_name = session.configurations[0]
-        findings.append(doubtful("configurations.other_assembly", first_name, turn=turn))
+    # the mirror image below a flat base is turned little, but far away
+    apart = pose_difference(modes, poses[0])
+    turns, shifts = (np.linalg.norm(part, axis=-1) for part in (apart[:, :3], apart[:, 3:]))
+    reach = SAME_POSE_TURN * size_of(session.machine)
+    near = np.hypot(turns / SAME_POSE_TURN, shifts / reach)
+    near = np.where(near > SAME_SOLUTION_SHARE, near, np.inf)
+    if near.min() < 1:
+        nearest = int(near.argmin())
+        findings.append(
+            doubtful(
+                "configurations.other_assembly", session.configurations[0],
+                turn=float(turns[nearest]), shift=float(shifts[nearest]),
+            )
+        )  # fmt: skip
     return _NominalKinematics(poses, float(fk.singularity.min()), len(modes), tuple(findings))
 
 

@@ -17,7 +17,7 @@ from pkmcal.checks.results import BoardCheck, JointCheck, SessionCheck, StationC
 from pkmcal.files import resolved
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.judge.repeatability import RepeatStudy, part_of
-from pkmcal.levels import MAJORITY, RELEVANT_FACTOR
+from pkmcal.levels import FEW, MAJORITY, RELEVANT_FACTOR
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.observe.profiles import PROFILE_OPTIONS
 from pkmcal.outcome import Figure, Mark, Outcome, Part, Row, Table, Verdict
@@ -120,6 +120,11 @@ def board_findings(session: Session, number: int, check: BoardCheck) -> list[Fin
         findings.append(doubtful("board.corners_off", **at, rms=check.rms))
     if check.unseen:
         findings.append(doubtful("board.part_unseen", **at, part=check.unseen.capitalize()))
+    # a board on the base needs one image, each configuration one of a board on the platform
+    if session.board_body == "platform" and check.found < FEW * len(station.images):
+        findings.append(
+            doubtful("board.few_images", **at, number=check.found, of=len(station.images))
+        )
     if session.board_body == "base" and check.found == 1 and len(station.images) > 1:
         findings.append(note("board.seen_once", **at))
     return findings

@@ -68,25 +68,20 @@ class PairProblem:
 
     body, observed : (B, K, 4, 4).
     weight : (B, K).
-    turn, shift : standard deviations of a pose, rad and m.
+    whiten : (K, 6, 6), or (6, 6) for all poses, as in :class:`~pkmcal.measurements.sets.Poses`.
     size : prior sigma of the mount's position about zero, m.
     """
 
     body: Array
     observed: Array
     weight: Array
-    turn: float
-    shift: float
+    whiten: Array
     size: float
-
-    @property
-    def _sigma(self) -> Array:
-        return np.repeat([self.turn, self.shift], 3)
 
     def differences(self, state: Pair) -> Array:
         """Whitened errors (B, K, 6) of the predicted poses, without weights."""
         predicted = state.T_camera_base[:, None] @ self.body @ state.T_mount[:, None]
-        return pose_difference(predicted, self.observed) / self._sigma
+        return (self.whiten @ pose_difference(predicted, self.observed)[..., None])[..., 0]
 
     def residuals(self, state: Pair) -> Values:
         """Weighted errors and the prior of the mount's position."""
@@ -99,7 +94,9 @@ class PairProblem:
         none = np.zeros((*one.shape, 0), dtype=int)
         blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), none)
         data = PoseData(
-            self.observed[:, :, None], np.diag(1 / self._sigma), self.weight[:, :, None],
+            self.observed[:, :, None],
+            np.broadcast_to(self.whiten, (*self.weight.shape[1:], 6, 6))[None, :, None],
+            self.weight[:, :, None],
             np.zeros((1, 1, 1, 6, 0)),
         )  # fmt: skip
         camera, mount = state.T_camera_base[:, None], state.T_mount[:, None]
@@ -126,6 +123,11 @@ class PairProblem:
         return replace(self, body=parts[0], observed=parts[1], weight=parts[2])
 
 
+def whitener(turn: float, shift: float) -> Array:
+    """Whitening (6, 6) of errors of standard deviations ``turn`` (rad) and ``shift`` (m)."""
+    return np.diag(1 / np.repeat([turn, shift], 3))
+
+
 def solve_pairs(body: Array, observed: Array, size: float) -> Pair:
     """Camera and mount of B runs from the platform's poses and the board's, (B, K, 4, 4) each.
 
@@ -142,8 +144,7 @@ def solve_pairs(body: Array, observed: Array, size: float) -> Pair:
         body,
         observed,
         np.ones(body.shape[:2]),
-        DRAWN_POSE_TURN_SIGMA,
-        DRAWN_POSE_SHIFT_SHARE * size,
+        whitener(DRAWN_POSE_TURN_SIGMA, DRAWN_POSE_SHIFT_SHARE * size),
         size,
     )
     apart = np.zeros(body.shape[:2])
@@ -204,8 +205,8 @@ def _turns(body: Array, observed: Array) -> list[tuple[Array, Array]]:
     right[..., 1:, 1:] -= 2 * skew((q_body @ conjugate)[..., 1:])
     each = _left_product(q_measured) @ right @ conjugate
     u, _, vt = np.linalg.svd(np.sum(sign[..., None, None] * each, axis=1))
-    laid = quaternion(register(body[..., :3, 3], observed[..., :3, 3])[..., :3, :3])
-    along = u.mT @ laid[..., None]
+    aligned = quaternion(register(body[..., :3, 3], observed[..., :3, 3])[..., :3, :3])
+    along = u.mT @ aligned[..., None]
     out: list[tuple[Array, Array]] = []
     for rank in HAND_EYE_RANKS:
         coefficients = along * (np.arange(4) < rank)[:, None]

@@ -195,12 +195,12 @@ class NoiseShares:
         from scipy.special import chdtrc
 
         informative = self.own > NEGLIGIBLE * self.own.max(axis=1, keepdims=True, initial=0.0)
-        shares = self._only(informative & self._in_likelihood)
+        shares = self._restricted_to(informative & self._in_likelihood)
         variance = shares.own / scale[:, None] ** 2 + shares.others + shares.fixed
         stated = np.sum(np.log(variance) + shares.z**2 / variance, axis=-1)
         return chdtrc(2, np.maximum(stated - shares.maximum_likelihood[1], 0.0))
 
-    def _only(self, directions: Booleans) -> NoiseShares:
+    def _restricted_to(self, directions: Booleans) -> NoiseShares:
         """Only some directions (B, n), the others as padding."""
         z, own, others = (
             np.where(directions, part, 0.0) for part in (self.z, self.own, self.others)
@@ -218,7 +218,7 @@ class NoiseShares:
     @cached_property
     def _by_data(self) -> NoiseShares:
         """The directions in the likelihood."""
-        return self._only(self._in_likelihood)
+        return self._restricted_to(self._in_likelihood)
 
     @cached_property
     def _intervals(self) -> dict[float, tuple[Array, Array]]:

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 CONVENTION_NULL_SHARE = 1e-6
 """Effect of a fixed parameter on the platform, in m per m or rad, that the free parameters cannot
 reproduce; below this value it is rounding, and the parameter is a convention."""
+PURE_FRAME_SINE = 1e-4
+"""Sine of the angle between a change and the frames' changes below which it is one of them."""
 
 
 @dataclass(frozen=True)
@@ -374,7 +376,8 @@ def _cosines(changes: Array, space: _Open) -> tuple[Array, Array]:
     size = np.linalg.norm(columns, axis=1)
     columns = columns[size > 0] / size[size > 0, None]
     # pure frame changes are removed, with their rounding
-    basis = _orthonormal(columns - (columns @ space.frames) @ space.frames.T, 1e-4)
+    rest = columns - (columns @ space.frames) @ space.frames.T
+    basis = _orthonormal(rest[np.linalg.norm(rest, axis=1) > PURE_FRAME_SINE], PURE_FRAME_SINE)
     u, s, _ = np.linalg.svd(space.rows @ basis.T)
     cosine = np.zeros(len(u))
     cosine[: len(s)] = s

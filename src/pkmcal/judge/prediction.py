@@ -3,7 +3,7 @@
 Stations, mounts and platform poses are estimated from the images with the machine fixed
 (:mod:`pkmcal.judge.fixed_machine`). Where images do not determine the poses of stations and boards
 (a board is observed by a camera of unknown pose), the readings of *other* configurations do:
-closures enter the estimate with the large standard deviation :data:`SOFT_READING_NOISE`, so that
+closures enter the estimate with the large standard deviation :data:`SOFT_READING_NOISES`, so that
 any observation dominates them, and each configuration's own readings are then removed exactly, by
 their leverage (leave-one-out).
 
@@ -37,16 +37,18 @@ from pkmcal.solver.elimination import Linear, Reduced, eliminate, rows_on_shared
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space, inverse_root
 from pkmcal.solver.search import Stop
 
-SOFT_READING_NOISE = 0.01
+SOFT_READING_NOISES = 0.01, 0.001, 0.0001
 """Standard deviation (m, rad) of readings in the estimate of stations and poses: tens of times the
-uncertainty by an image, so that an observed pose hardly depends on them.
+uncertainty by an image, so that an observed pose hardly depends on them. The smaller ones serve
+where the search does not converge: where readings alone tell the board's place from the camera's,
+as on a platform that hardly rotates, softness lets both slide along a curved valley.
 """
 WIDEST_PREDICTION = 0.1
 """Largest standard deviation (m, rad) of a predicted reading: beyond it the leave-one-out fit, a
 step of first order, is not valid."""
 LEAST_REDUNDANCY = 1e-4
 """Smallest eigenvalue of L: its inverse amplifies what the search leaves, 1e-7 of
-SOFT_READING_NOISE, to 10 um."""
+SOFT_READING_NOISES, to 10 um."""
 FRAME_LAYING_STEPS = 20
 FRAMES_LAID_CHANGE = 1e-10
 """Change of the frames (m, rad) below which their registration has converged."""
@@ -104,9 +106,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     # first: from afar, a search with soft readings follows a curved valley.
     measurements = replace(measurements, links=())
     near = hold(machine, measurements, start).located(start)
-    held = hold(machine, replace(measurements, joint_noise=SOFT_READING_NOISE), near)
-    if held.stop is not Stop.CONVERGED:
-        raise not_converged(held.stop)
+    soft, held = _softly_held(machine, measurements, near)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])
@@ -120,8 +120,8 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     redundancy = np.eye(m) - along - beside @ beside.mT  # L
     determined = np.linalg.eigvalsh(redundancy).min(axis=-1) >= LEAST_REDUNDANCY
     alone = np.linalg.inv(np.where(determined[:, None, None], redundancy, np.eye(m)))
-    units = _reading_per_sigma(held)[..., None] * alone
-    less = 1 - (measurements.joint_noise / SOFT_READING_NOISE) ** 2
+    units = _reading_per_sigma(held, soft)[..., None] * alone
+    less = 1 - (measurements.joint_noise / soft) ** 2
     noise = _noise(along, beside, units, less)
     blocks = np.einsum("kikj->kij", noise.reshape(n, m, n, m))
     determined &= np.linalg.eigvalsh(blocks).max(axis=-1) <= WIDEST_PREDICTION**2
@@ -156,6 +156,15 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     )
 
 
+def _softly_held(machine: Machine, measurements: Measurements, near: State) -> tuple[float, Held]:
+    """The largest of SOFT_READING_NOISES with which the search ends, and its fit."""
+    for soft in (max(noise, measurements.joint_noise) for noise in SOFT_READING_NOISES):
+        held = hold(machine, replace(measurements, joint_noise=soft), near)
+        if held.stop is Stop.CONVERGED:
+            return soft, held
+    raise not_converged(Stop.STEPS)
+
+
 def _reading_selector(held: Held, n_rows: int) -> Array:
     """E (K', m, r): selects the rows of readings among those of a configuration."""
     problem, state = held.problem, held.state
@@ -169,15 +178,15 @@ def _reading_selector(held: Held, n_rows: int) -> Array:
     return out
 
 
-def _reading_per_sigma(held: Held) -> Array:
+def _reading_per_sigma(held: Held, soft: float) -> Array:
     """Reading (K', m) that corresponds to one standard deviation of its row, m or rad, with its
-    sign.
+    sign; soft : standard deviation of readings in the rows.
     """
     layout, c = held.problem.layout, held.problem.closure(held.state)
     by_reading = c.by_reading[0]
     slope = np.sqrt(by_reading**2 @ layout.of_motor)
     sign = 1.0 if layout.shares_motors else np.sign(by_reading @ layout.of_motor)
-    return sign * np.hypot(PERFECT_CLOSURE_SIGMA, SOFT_READING_NOISE * slope) / slope
+    return sign * np.hypot(PERFECT_CLOSURE_SIGMA, soft * slope) / slope
 
 
 def _leave_one_out(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> BatchState:
@@ -211,7 +220,7 @@ def _noise(along: Array, beside: Array, units: Array, less: float) -> Array:
 
     along : D (K', m, m), projection of the readings' rows onto their own unknowns. beside : F (K',
     m, a), onto the shared ones: ``H = E P E^T = 1 - D - F F^T``. Rows have unit variance, but
-    readings have less than SOFT_READING_NOISE, by the share ``less`` of its variance: the
+    readings have less than their softness, by the share ``less`` of its variance: the
     covariance of E P y is ``H - less H H``, in a form without differences of nearly equal numbers.
     """
     n, m = along.shape[:2]

@@ -191,20 +191,26 @@ def image_mistake(
     # no hypothesis explains the images
     others = [station.name for station in bad if station is not worst]
     at = ", nor in those of " + listed(others) if others else ""
-    few = len(worst.view.configuration) < ENOUGH_IMAGES_ALONE
+    count = len(worst.view.configuration)
     calibrated = worst.view.earlier_joints is not None
     enough = ENOUGH_IMAGES_OF_CALIBRATED if calibrated else USUAL_IMAGES
+    more = ""
+    if count < ENOUGH_IMAGES_ALONE:
+        more = (
+            f"Take more images from there, {enough} are usual: with so few no exchange of images"
+            " or readings can be detected. If there are more, check"
+        )
+    elif count < USUAL_IMAGES and worst.localization.p_value >= worst.localization.limit:
+        more = (
+            "Take images of more configurations, in which the legs stand more differently. If they"
+            " do, check"
+        )
     return InputError(
         f"the machine was not localized in the images of {worst.name}{at}",
         where=f"session.yaml, stations.{worst.name}",
         found=_little(worst),
         expected="one place where its legs lie on image edges far more often than by chance",
-        next_step=(
-            f"Take more images from there, {enough} are usual: with so few"
-            " no exchange of images or readings can be detected. If there are more, check"
-            if few
-            else "Check"
-        )
+        next_step=(more or "Check")
         + " that these images show this machine's legs, that each bears the name"
         " of its configuration, and that the nominal model is this machine's"
         + ("" if worst.by_hand is not None else "; a pose by hand, right to 20 cm, may help"),

@@ -189,8 +189,8 @@ class HexapodByLegs:
             centres = fit.extra["centres"]
             off = centres - truth
             T = register(np.broadcast_to(nominal, centres.shape), centres)
-            laid = apply(T[:, None], nominal)
-            square = np.sum((centres - laid) ** 2, axis=-1)
+            registered = apply(T[:, None], nominal)
+            square = np.sum((centres - registered) ** 2, axis=-1)
             out[key] = Sample(
                 {
                     "centre": np.sqrt(np.sum(off**2, axis=-1)),

@@ -165,7 +165,7 @@ def views_plot(c: CameraCalibration) -> Plot | None:
     )
 
 
-def _runs(terms: Sequence[str]) -> list[str]:
+def _abbreviated(terms: Sequence[str]) -> list[str]:
     """Terms of a distortion with three or more in sequence as one, ``k3–k6``."""
     runs: list[list[str]] = []
     for term in terms:
@@ -187,7 +187,7 @@ def models_plot(c: CameraCalibration) -> Plot | None:
     fitted, left_out = list[Point](), list[Point]()
     for one in c.compared:
         chosen = (one.model, one.terms) == (c.camera.model, c.terms)
-        name = ("✓ " if chosen else "") + " ".join((one.model, *_runs(one.terms)))
+        name = ("✓ " if chosen else "") + " ".join((one.model, *_abbreviated(one.terms)))
         tip = f"{name}: fitted {brief(one.rms)} px, held out {brief(one.left_out)} px"
         for points, value in ((fitted, one.rms), (left_out, one.left_out)):
             if np.isfinite(value) and value > 0:

@@ -85,7 +85,7 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
                     f"median over {d.tool.region}; at worst {worst} mm{spread}",
                 )
             )
-    shifted = np.concatenate([_moved(side) for side in d.centres])
+    shifted = np.concatenate([_displacements(side) for side in d.centres])
     out.append(
         Figure(
             "How far did the joints move?",
@@ -105,7 +105,7 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
     return tuple(out)
 
 
-def _moved(side: Centres) -> Array:
+def _displacements(side: Centres) -> Array:
     """Distances (L,) that a body's joints moved, mm; zero within rounding."""
     distance = np.linalg.norm(side.change, axis=-1)
     return 1e3 * np.where(distance > ROUNDING, distance, 0.0)
@@ -144,7 +144,7 @@ def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
 def _legs(d: MachineDifference) -> Table:
     """Table of the distances that each leg's joints moved."""
     rows: list[Row] = []
-    sides = [(_moved(x), x.sigma * 1e3) for x in d.centres]
+    sides = [(_displacements(x), x.sigma * 1e3) for x in d.centres]
     by_chance = bool(d.change.dof)
     for leg in range(d.a.machine.n_legs):
         cells = tuple(
@@ -216,7 +216,7 @@ def _joints(d: MachineDifference) -> Plot:
     most = 0.0
     colours: tuple[Colour, Colour] = ("nominal", "calibrated")
     for side, colour in zip(d.centres, colours, strict=True):
-        shifted = _moved(side)
+        shifted = _displacements(side)
         sigma = side.sigma * 1e3 if d.change.dof else np.zeros_like(shifted)
         most = max(most, float((shifted + sigma).max()))
         points = tuple(

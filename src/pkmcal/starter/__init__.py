@@ -68,7 +68,8 @@ READINGS_ALONE_HEADER_TEXT = """\
 #   1. mechanism.yaml      the nominal model of your machine
 #   2. Move the machine to a configuration, wait until it stands still, and note what the encoders
 #      read, not what was commanded. 30 configurations or more, all over what it reaches.
-#   3. joints.csv          the readings: one row a configuration, in metres (or radians)
+#   3. joints.csv          the readings: one row a configuration, in the heads' units, or in metres
+#      and radians
 #   4. pkmcal check, in this folder's place, until it finds nothing wrong; then pkmcal calibrate
 """
 READINGS_ALONE_TEXT = """\
@@ -83,9 +84,16 @@ BOARD_TEXT = """\
    not always seen from the same side.
 """
 DRIVE_NOISE_TEXT = """\
-  # Standard deviation of a reading: about a third of the encoder's repeatability.
+  # Standard deviation of a reading: about a third of the encoder's repeatability. A hobby servo has
+  # none, its readings are commands: state what a command leaves open, such as 0.5 deg.
   noise: 0.001 deg
 """
+
+TURNING_ADVICE = (
+    "legs near their\n#      shortest and longest help most.",
+    "readings\n#      near both ends of their ranges help most.",
+)
+"""What the template advises on configurations, and what of a machine whose motors turn."""
 
 
 def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
@@ -228,6 +236,7 @@ def _session_text(text: str, hexapod: bool, turns: bool, what: ObservedChoice, p
     if turns:
         start, end = text.index("  # Standard deviation"), text.index("\n# One entry")
         text = text[:start] + DRIVE_NOISE_TEXT + text[end:]
+        text = text.replace(*TURNING_ADVICE)
     if what == "readings":
         text = text[text.index("pkmcal: 1") : text.index("# One entry")]
         return READINGS_ALONE_HEADER_TEXT + text + READINGS_ALONE_TEXT

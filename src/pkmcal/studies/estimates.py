@@ -12,7 +12,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.bundle import BatchResult, solve_batch
-from pkmcal.identify.hand_eye import Pair, PairProblem
+from pkmcal.identify.hand_eye import Pair, PairProblem, whitener
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
@@ -123,7 +123,7 @@ def tool_errors(
     fk = forward(layout, theta[..., None, :], at.readings, at.poses).T_base_platform
     still = np.broadcast_to(np.eye(4), (len(fk), 4, 4))
     weight = np.ones(fk.shape[:2])
-    problem = PairProblem(fk, at.poses, weight, turn, shift, FREE_TOOL_FRAME_SIGMA)
+    problem = PairProblem(fk, at.poses, weight, whitener(turn, shift), FREE_TOOL_FRAME_SIGMA)
     pair: Pair = minimise(problem, Pair(still, still)).state
     off = problem.differences(pair) * np.repeat([turn, shift], 3)
     size = np.sqrt(np.mean(np.square(off).reshape(*off.shape[:2], 2, 3).sum(axis=-1), axis=1))

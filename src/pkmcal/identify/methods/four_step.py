@@ -165,8 +165,8 @@ def solve_from_centres(
     weight = np.broadcast_to(visible, b.shape[:-1]).astype(float)
     if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
         # distances do not determine the rotation of a translating platform against the base frame
-        laid = poses_laying_items(platform[:, None], b[:, posed], weight[:, posed])
-        rot = laid[..., :3, :3].mean(axis=1)
+        registered = poses_laying_items(platform[:, None], b[:, posed], weight[:, posed])
+        rot = registered[..., :3, :3].mean(axis=1)
         platform = platform @ nearest_rotation(rot).mT
     T = poses_laying_items(platform[:, None], b, weight, motion=legs.motion)
     if legs.planar:  # the platform frame keeps its nominal height

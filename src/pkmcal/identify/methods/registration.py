@@ -233,7 +233,8 @@ def _own_motions(items: Array, directions: int, motion: Array) -> Array:
     p = items.copy()
     p[:n] -= items[:n].mean(axis=0)
     own = np.zeros((len(items), 3, 6))
-    own[..., :3], own[:n, :, 3:] = -skew(p / np.sqrt(np.mean(dot(p, p)))), np.eye(3)
+    size = np.sqrt(np.mean(dot(p, p))) or 1.0  # a single point has none
+    own[..., :3], own[:n, :, 3:] = -skew(p / size), np.eye(3)
     return (own @ motion).reshape(-1, motion.shape[1])
 
 
