@@ -23,7 +23,8 @@ class PriorScene(NamedTuple):
     T_base_platform : (K, 4, 4) of the configurations.
     edges : silhouettes of each localized hand-held image, by station.
     prior : marginal prior of the machine from these edges and the nominal model.
-    scatter : ratio of the scatter of these edges to their stated standard deviations.
+    scatter : ratio of the scatter of silhouettes to their standard deviations as measured; these
+        edges are scaled by it.
     findings : notes on poses that could not be tested.
     """
 

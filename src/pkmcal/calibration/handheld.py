@@ -85,8 +85,9 @@ class HandheldOptions:
     # largest number of images that are scored with the nominal model, which takes twice as long as
     # with a machine from images
     most_from_nominal: int = 12
-    # largest number of rounds in which images without an accepted pose are scored again
-    most_rounds: int = 2
+    # largest number of rounds in which images without an accepted pose are scored again: by their
+    # neighbours, by more hypotheses, and with the images that these two have added
+    most_rounds: int = 3
     # ratio by which the number of images that determine the machine must grow before the poses of
     # an image are scored anew
     rescoring_growth: float = PoseScoringOptions.refined_again_growth
@@ -264,8 +265,13 @@ def _searched(
         """Search images side by side; each is counted when it is ready."""
         progress(text, 0.0)
         tasks = {k: pool.submit(one, k) for k in some}
-        for done, _ in enumerate(as_completed(tasks.values()), start=1):
-            progress(f"{text}: {done} of {len(some)}", done / len(some))
+        try:
+            for done, task in enumerate(as_completed(tasks.values()), start=1):
+                task.result()
+                progress(f"{text}: {done} of {len(some)}", done / len(some))
+        finally:  # after an error, images that have not begun are not searched
+            for task in tasks.values():
+                task.cancel()
         answers.update((k, task.result()) for k, task in tasks.items())
 
     def rescore(some: Sequence[int], text: str, progress: Progress) -> None:
@@ -283,7 +289,7 @@ def _searched(
     with ThreadPoolExecutor(THREADS) as pool:
         # each image by itself
         text = "Localizing hand-held images"
-        search(lambda k: _alone(session, scene, at[k]), by_hand, text, part(progress, 0, 0.3))
+        search(lambda k: _alone(session, scene, room, at[k]), by_hand, text, part(progress, 0, 0.3))
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = min((len(clearer) + 1) // 2, _OPTIONS.most_from_nominal)
@@ -292,9 +298,8 @@ def _searched(
         text = f"Scoring the others, with {len(so_far.placed)} images localized"
         rescore(clearer[half:], text, part(progress, 0.43, 0.56))
         # join the images of a board, and score images without an accepted pose again
-        for k, one in _on_board(hypotheses(), boards).items():
-            if k in answers:  # poses that the session states remain
-                answers[k] = replace(answers[k], places=one)
+        joint = _on_board(hypotheses(), boards)  # poses that the session states remain
+        answers |= {k: replace(answers[k], places=joint[k]) for k in answers.keys() & joint.keys()}
         so_far = register(part(progress, 0.56, 0.6))
         rest = part(progress, 0.6, 1)
         for _ in range(_OPTIONS.most_rounds):
@@ -302,11 +307,13 @@ def _searched(
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.with_few_legs]
             if not so_far.placed or not unsure:
                 break
-            placed = len(by_hand) - len(unsure)
+            before, placed = so_far, len(by_hand) - len(unsure)
             text = f"Scoring again, with {placed} of {len(by_hand)} images localized"
             rescore(unsure, text, part(rest, 0, 0.7))
             so_far = register(part(rest, 0.7, 0.8))
             rest = part(rest, 0.8, 1)
+            if so_far is before and all(answers[k].anew for k in unsure):
+                break  # nothing that a further round could use is new
     out = _final_poses(so_far, accepted_poses(), (*by_hand, *stated))
     untested = tuple(_untested(session, so_far, answers, out))
     return hypotheses(), so_far.scene._replace(T_camera_base=out, findings=untested)
@@ -395,6 +402,7 @@ class _CachedHypotheses:
     scores : by the joint estimate, None before it.
     by : marginal prior of the machine at that time, None for the nominal model.
     beside : number of images that determined the machine.
+    by_neighbours : whether poses by the background of single neighbours have been tried.
     anew : whether ``hypotheses`` are by a machine from images.
     """
 
@@ -403,6 +411,7 @@ class _CachedHypotheses:
     scores: ScoredPoses | None = None
     by: MarginalPrior | None = None
     beside: int = 0
+    by_neighbours: bool = False
     anew: bool = False
 
 
@@ -459,8 +468,11 @@ def _too_few_legs(scene: PriorScene, image: StationImages) -> bool:
     return len(visible) < _fewest_legs(machine)
 
 
-def _alone(session: Session, scene: PriorScene, image: StationImages) -> _CachedHypotheses:
+def _alone(
+    session: Session, scene: PriorScene, room: Surroundings, image: StationImages
+) -> _CachedHypotheses:
     """Hypotheses from one image alone, from the cache where it was localized before."""
+    room.texture(image.station)  # for later steps, here on several threads
     name = image_name(session, scene.machine, image.station)
     hypotheses = remembered_image(name)
     if hypotheses is None:
@@ -494,14 +506,15 @@ def _search(
     """Pose hypotheses of an image, weighted by its legs and by the background.
 
     The background is compared with that of the images with accepted poses; earlier hypotheses are
-    among the candidates. An image that stays ambiguous is localized with the first machine from
-    images: by itself once more, among more hypotheses, because later images change the machine
-    little, and by the background of each of its neighbours. Poses that were scored with a similar
-    machine are not scored again.
+    among the candidates. An image that stays ambiguous is localized with the machine from images:
+    by the background of each of its neighbours and, if that does not suffice, once by itself among
+    more hypotheses, because later images change the machine little. Poses that were scored with a
+    similar machine are not scored again.
     """
     p, scene, placed, k = image.decoded(), so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
-    anew = before.anew or (scene.prior is not None and before.scores is not None)
+    by_neighbours = scene.prior is not None and before.scores is not None
+    anew = before.anew or before.by_neighbours
     if anew and not before.anew:
         alone = _image_hypotheses(session, scene, p, _OPTIONS.wider)
     elif (
@@ -518,13 +531,13 @@ def _search(
     if placed:
         axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
-    if placed and anew:
+    if placed and by_neighbours:
         others = np.concatenate([others, _by_neighbours(session, room, so_far, p, tables)])
     # joint estimate, then the background
     closer, scores = rescore_poses(session, p, scene, alone, others, scores, tables)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
-    return _CachedHypotheses(alone, places, scores, by, beside, anew)
+    return _CachedHypotheses(alone, places, scores, by, beside, by_neighbours, anew)
 
 
 def _by_neighbours(

@@ -27,7 +27,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import PriorScene
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.bundle import Fit, fit_state, fit_states, marginalize_to_machine
+from pkmcal.identify.bundle import BATCH, Fit, fit_state, fit_states, marginalize_to_machine
 from pkmcal.identify.start import start_state
 from pkmcal.identify.state import State
 from pkmcal.measurements import EdgeSet, of_stations
@@ -91,8 +91,8 @@ def register_images(
 ) -> PriorScene:
     """Scene estimated with further images at poses ``places``, T_camera_base (4, 4) by station.
 
-    The silhouettes of images registered earlier are measured again too, because theirs depend on
-    the machine assumed at the time. Raises a `PkmcalError` if nothing can be estimated.
+    If these are many, they change the machine, and the silhouettes of images registered earlier are
+    measured again too. Raises a `PkmcalError` if nothing can be estimated.
 
     images : by station.
     boards : boards in these images.
@@ -100,14 +100,18 @@ def register_images(
     n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
     near = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
     again = len(near) >= _OPTIONS.refined_again_growth * len(scene.edges)
-    refined = (near if again else places).keys()
+    measured = refined = (near if again else places).keys()
     scene = scene._replace(prior=None)
     for number in range(n_passes):
-        measured = part(progress, number / n_passes, (number + 1) / n_passes)
-        near, edges = _silhouettes(session, images, scene, near, refined, measured)
-        last, fit = _joint_fit(session, scene, near, edges, boards)
+        own = part(progress, number / n_passes, (number + 1) / n_passes)
+        places = {k: near[k] for k in measured}
+        places, edges = _silhouettes(session, images, scene, places, refined, own)
+        last, fit = _joint_fit(session, scene, near | places, {**scene.edges, **edges}, boards)
         # scatter of the silhouettes from their residuals, relative to the stated sigmas
-        scene = last._replace(scatter=scene.scatter * fit.edge_scale)
+        scene = last._replace(
+            scatter=scene.scatter * fit.edge_scale,
+            edges={k: one.scaled(fit.edge_scale) for k, one in last.edges.items()},
+        )
         if number + 1 == n_passes:
             scene = scene._replace(prior=marginalize_to_machine(fit.info))
         near, refined = {k: scene.T_camera_base[k] for k in near}, ()
@@ -137,7 +141,8 @@ def _silhouettes(
         return T, silhouette_edges(view, T, k).edges.scaled(scene.scatter)
 
     poses, edges, stations = dict[int, Array](), dict[int, EdgeSet](), sorted(places)
-    text = f"Estimating {len(stations)} localized images together"
+    count = len(scene.edges.keys() | places.keys())
+    text = f"Estimating {count} localized images together"
     with ThreadPoolExecutor(THREADS) as pool:
         for k, one in zip(stations, pool.map(measure, stations), strict=True):
             poses[k], edges[k] = one
@@ -187,7 +192,11 @@ def evaluate_poses(
         EvaluatedPose(scene.machine, replace(begin, T_camera_base=T[None]), EdgeSet.empty(), 0.0)
         for T in T_camera_base
     ]
-    for _ in range(_OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal):
+    n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
+    for number in range(n_passes):
+        # while edges are matched from errors of pixels, weights and noise need not converge
+        rough = number < n_passes - _OPTIONS.passes_from_prior
+        options = replace(BATCH, most_rounds=0) if rough else BATCH
         before = {k: one for k, one in enumerate(results) if isinstance(one, EvaluatedPose)}
         edges = [
             silhouette_edges(one.view_in(view), one.T_camera_base, 0).edges.scaled(scene.scatter)
@@ -195,7 +204,7 @@ def evaluate_poses(
         ]
         measurements = [replace(nothing, edges=own) for own in edges]
         starts = [one.state for one in before.values()]
-        fits = fit_states(session.machine, measurements, starts, scene.prior)
+        fits = fit_states(session.machine, measurements, starts, scene.prior, options)
         for k, own, fit in zip(before, edges, fits, strict=True):
             failed = isinstance(fit, PkmcalError)
             results[k] = fit if failed else EvaluatedPose(fit.machine, fit.state, own, fit.change)

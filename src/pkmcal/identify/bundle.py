@@ -671,6 +671,7 @@ def fit_states(
     measurements: Sequence[Measurements],
     starts: Sequence[State],
     marginal_prior: MarginalPrior | None = None,
+    options: BatchOptions = BATCH,
 ) -> list[Fit | PkmcalError]:
     """Estimates as by :func:`fit_state` of trials that differ in their edges and starts, as runs of
     one batch; the error of each that has none.
@@ -691,7 +692,7 @@ def fit_states(
         begin = [starts[k] for k in runs]
         assembled = assemble_runs(machine, [measurements[k] for k in runs], gauge)
         problem, batch = _prepared(machine, assembled, begin, marginal_prior)
-        result = solve_batch(problem, batch, scale_readings=False)
+        result = solve_batch(problem, batch, scale_readings=False, options=options)
         fits |= zip(runs, _fits(machine, begin, assembled, result, gauge), strict=True)
         for k, stop in zip(runs, result.solution.stop, strict=True):
             if stop in (Stop.NOT_FINITE, Stop.STALLED):

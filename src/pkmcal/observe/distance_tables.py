@@ -107,8 +107,11 @@ class DirectionTables:
 
     def _work_out(self, direction: int) -> None:
         """Compute the table and the chance density of one direction."""
+        import cv2
+
         rows, taken_in = len(self.picture), bin_neighbours(direction, len(self.ready))
-        counted = np.ones(self.chance.shape[1])  # a distance that does not occur is not impossible
+        bins = self.chance.shape[1]
+        counted = np.ones(bins)  # a distance that does not occur is not impossible
         for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
             write_distances(place[taken_in.take(number)], table)
@@ -118,8 +121,8 @@ class DirectionTables:
             # every second pixel of every second row: with fewer, the chance densities would differ
             # between hypotheses about one image
             bin_number = tables[:, ::2, ::2] * np.float32(1 / self.options.bin_width)
-            bin_number = np.minimum(bin_number, len(counted) - 1).astype(np.intp)
-            counted += np.bincount(bin_number.ravel(), minlength=len(counted))
+            bin_number = np.minimum(bin_number, bins - 1).astype(np.uint16).reshape(1, -1)
+            counted += cv2.calcHist([bin_number], [0], None, [bins], [0, bins]).ravel()
         self.chance[direction] = counted / counted.sum() / self.options.bin_width
         self.ready[direction] = True  # last, because other threads read it
 

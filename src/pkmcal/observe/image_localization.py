@@ -45,12 +45,11 @@ from pkmcal.observe.pose_likelihood import (
     StationView,
     distances_under,
     distinct_silhouettes,
-    divided,
     mixture_of,
     refine_lm,
     refine_ml,
 )
-from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed, visible_stretch
+from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
 from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, TubeChart, TubeChartOptions, tube_chart
 
 
@@ -442,17 +441,8 @@ def _log_likelihood(view: StationView, values: Array, samples: int) -> Array:
     """Log-likelihood ratios (H,) of poses (H, 4, 4) by the silhouettes that no other leg hides or
     borders: with two legs on one line in the image, its edges would count twice.
     """
-    parts = divided(view, len(values), samples)
-    if len(parts) > 1:
-        return np.concatenate([_log_likelihood(view, values[k], samples) for k in parts])
     one = np.zeros(1, dtype=int)
-    distances = distances_under(view, values, one, samples)
-    legs = view.legs(one).under(values)[:, 0]
-    points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
-    clear = unobstructed(
-        view.machine, view.camera, legs, view.tubes, points, EDGE_OPTIONS.clearance
-    )
-    distances = distances._replace(length=np.where(clear, distances.length, 0.0))
+    distances = distances_under(view, values, one, samples, EDGE_OPTIONS.clearance)
     return distances.log_likelihood(mixture_of(distances, view.options)).sum(axis=(1, 2))
 
 
@@ -497,7 +487,7 @@ def _hypotheses(view: StationView, chart: TubeChart, options: ImageLocalizationO
         charted = _charted_tubes(in_view, tubes.radius, chart)
         for turn in range(options.candidates.turns):
             angle = 2 * np.pi * turn / options.candidates.turns
-            score = _scores(charted, angle, chart, windows, options)
+            score = _scores(charted, angle, chart, windows, len(steps[1]), options)
             for _ in range(options.positions):
                 best = score.argmax(axis=-1)[:, None]
                 shifts += [best]
@@ -542,30 +532,14 @@ def _tubes(view: StationView) -> _Tubes:
 def _windows(
     surprisal: Integers, steps: Sequence[Integers], options: ImageLocalizationOptions
 ) -> Integers:
-    """View of the maps in which [width, direction, y, x] is the window of all shifts, (Sy, Sx).
+    """Values of the maps at all shifts to the right of each cell, (width, direction, y, x, Sx).
 
-    y and x count from the corner of the padded maps, see :func:`_border`.
+    The maps are padded by all shifts to each side, with cells without a tube.
     """
-    border = _border(surprisal)
-    padded = np.pad(surprisal, ((0, 0), (0, 0), (border, border), (border, border)))
-    nx, ny = (len(s) for s in steps)
-    shape = (
-        *surprisal.shape[:2],
-        padded.shape[2] - options.stride * ny,
-        padded.shape[3] - options.stride * nx,
-    )
-    stride = padded.strides
-    return np.lib.stride_tricks.as_strided(
-        padded,
-        (*shape, ny, nx),
-        (*stride, options.stride * stride[2], options.stride * stride[3]),
-        writeable=False,
-    )
-
-
-def _border(surprisal: Integers) -> int:
-    """Cells of padding around the maps, in which there is no tube."""
-    return max(surprisal.shape[2:])
+    ny, nx = (options.stride * len(s) for s in steps[::-1])
+    padded = np.pad(surprisal, ((0, 0), (0, 0), (ny, ny), (nx, nx)))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, nx, axis=-1)
+    return np.ascontiguousarray(windows[..., :: options.stride])
 
 
 class _ChartedTubes(NamedTuple):
@@ -608,28 +582,35 @@ def _scores(
     turn: float,
     chart: TubeChart,
     windows: Integers,
+    n_down: int,
     options: ImageLocalizationOptions,
 ) -> Array:
     """Mean map value (P, shifts) at the middles of the tubes, weighted by their length in the
     image.
 
     turn : rotation about the optical axis, rad.
-    windows : as :func:`_windows` returns them.
+    windows : as :func:`_windows` returns them. n_down : number of shifts downwards.
     """
     number = (
         np.rint((tubes.normal + turn) % np.pi * (chart.options.directions / np.pi)).astype(np.intp)
         % chart.options.directions
     )
-    # first cell of each tube's window of shifts
+    # first cell of each tube's window of shifts, in the padded maps
     middle = tubes.middle @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     at = np.floor((middle + chart.middle) / chart.options.map_cell).astype(np.intp)
-    shifts = windows.shape[-2:]
-    first = _border(chart.surprisal) - options.stride * (np.array(shifts[::-1]) // 2)
-    at = np.clip(at + first, 0, np.array(windows.shape[3:1:-1]) - 1)
-    out = np.empty((len(at), shifts[0] * shifts[1]), dtype=np.float32)
+    _, n_directions, height, width, n_right = windows.shape
+    down = options.stride * np.arange(n_down)
+    shifts = np.array([n_right, n_down])
+    at += options.stride * (shifts - shifts // 2)
+    at = np.clip(at, 0, [width - 1, height - 1 - down[-1]])
+    place = (tubes.width_number * n_directions + number) * height + at[..., 1]
+    place = place * width + at[..., 0]
+    # a row of the window after the other
+    rows = windows.reshape(-1, n_right)
+    out = np.empty((len(at), n_down * n_right), dtype=np.float32)
     for k in range(0, len(at), options.batch):
         part = slice(k, k + options.batch)
-        worth = windows[tubes.width_number[part], number[part], at[part, :, 1], at[part, :, 0]]
+        worth = rows.take(place[part, :, None] + width * down, axis=0)
         worth = worth.reshape(*worth.shape[:2], -1).astype(np.float32)
         out[part] = np.matmul(tubes.weight[part, None], worth)[:, 0]
     return out

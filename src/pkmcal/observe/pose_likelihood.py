@@ -30,6 +30,7 @@ from pkmcal.observe.predict import (
     normals_of_edges,
     of_edges,
     tubes_of,
+    unobstructed,
     visible_stretch,
 )
 from pkmcal.solver.marquardt import Damping
@@ -511,16 +512,30 @@ def divided(view: StationView, count: int, places: int) -> list[slice]:
 
 
 def distances_under(
-    view: StationView, candidates: Array, images: Integers, samples: int
+    view: StationView,
+    candidates: Array,
+    images: Integers,
+    samples: int,
+    clearance: float | None = None,
 ) -> Distances:
-    """Distances at the edges predicted from poses (H, 4, 4)."""
+    """Distances at the edges predicted from poses (H, 4, 4).
+
+    clearance : px from the outlines of other legs within which points are left out, as those are
+        that another leg hides; None for all points.
+    """
     parts = divided(view, len(candidates), len(images) * samples)
     if len(parts) > 1:
-        each = [distances_under(view.guess(k), candidates[k], images, samples) for k in parts]
+        each = [
+            distances_under(view.guess(k), candidates[k], images, samples, clearance) for k in parts
+        ]
         return Distances(*map(np.concatenate, zip(*each, strict=True)))
     points, direction, number = _edges_under(view, candidates, images, samples)
     distance, inside = view.tables.look_up(direction, points.pixel, number, between=True)
-    return _distances(view, points, direction, distance, inside & points.valid)
+    inside = inside & points.valid
+    if clearance is not None:
+        legs = view.legs(images).under(candidates)
+        inside &= unobstructed(view.machine, view.camera, legs, view.tubes, points, clearance)
+    return _distances(view, points, direction, distance, inside)
 
 
 def coinciding_edges(view: StationView, candidates: Array, images: Integers, samples: int) -> Array:

@@ -216,7 +216,7 @@ def unobstructed(
     edges: EdgePoints,
     clearance: float,
 ) -> Booleans:
-    """Mask (K, E, n) of the points in the image that no other leg hides or disturbs.
+    """Mask (..., E, n) of the points in the image that no other leg hides or disturbs.
 
     The viewing ray of a point passes the axis of another leg at some distance. If the distance is
     less than that leg's radius, the leg hides the point or lies behind it. A leg behind only
@@ -231,7 +231,7 @@ def unobstructed(
         others = machine.values[machine.layout.radius[j]]
         if others.size == 0:
             continue
-        a, b, u = (v[:, None, None, j] for v in (legs.a, legs.b, legs.u))
+        a, b, u = (v[..., j, None, None, :] for v in (legs.a, legs.b, legs.u))
         length, start = np.sqrt(dot(b - a, b - a)), dot(u, a)
         cosine, ahead = dot(rays, u), dot(rays, a)
         # position on the other leg's axis, m from a, nearest to the ray; depth is along the ray

@@ -15,7 +15,7 @@ the camera is nearly a shift.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cache, cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -172,8 +172,7 @@ def _support(grey: Array, options: TubeChartOptions) -> Array:
                 np.maximum,
                 (rows[:, n::spacing] for n in range(spacing)),
             )
-            length = max(options.support_widths * wide, options.least_length) / spacing
-            out[w, k] = cv2.filter2D(pair, -1, _line(np.array([-n[1], n[0]]), length))
+            out[w, k] = cv2.filter2D(pair, -1, _along_pair(options)[k][w])
     return out
 
 
@@ -195,6 +194,20 @@ def _shifted(values: Array, step: Integers) -> Array:
         max(y, 0) : height - max(-y, 0), max(x, 0) : width - max(-x, 0)
     ]
     return out
+
+
+@cache
+def _along_pair(options: TubeChartOptions) -> tuple[tuple[Array, ...], ...]:
+    """Kernels that average along a pair of each direction and each width."""
+    angles = np.pi * np.arange(options.directions) / options.directions
+    lengths = np.maximum(options.support_widths * options.widths, options.least_length)
+    return tuple(
+        tuple(
+            _line(np.array([-np.sin(angle), np.cos(angle)]), length / options.support_spacing)
+            for length in lengths.tolist()
+        )
+        for angle in angles
+    )
 
 
 def _line(along: Array, length: float) -> Array:
