@@ -155,8 +155,8 @@ class EvaluatedPose(NamedTuple):
 
     state : of this image alone; poses of other configurations are those of the start.
     edges : silhouettes of the image.
-    change_cost : cost of the machine's change, half the sum of squares by which the parameters and the
-        joint readings are moved.
+    change_cost : of the machine, half the sum of squares by which the parameters and the joint
+        readings are moved.
     """
 
     machine: Machine
@@ -243,7 +243,7 @@ class ScoredPoses(NamedTuple):
     """Scored poses (n, 4, 4) of one image.
 
     scores : (n,) log-likelihood ratio of the machine at each pose.
-    change_cost : (n,) cost of the machine's change.
+    change_cost : (n,), of the machine.
     failures : why further poses could not be tested.
     """
 
