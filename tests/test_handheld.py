@@ -1016,12 +1016,12 @@ def test_images_join_what_is_known(searched):
     right, none, beside = evaluate_poses(session, names, 2, np.stack([T, nowhere, near]), view)
     assert len(right.edges) > 6
     # half the squares of its edges' residuals, two numbers each
-    assert right.change_cost < len(right.edges)
+    assert right.cost < len(right.edges)
     assert none.code == "measurements.none"
     # a pose of a batch has the result that it has alone
     (alone,) = evaluate_poses(session, names, 2, near[None], view)
     np.testing.assert_allclose(beside.T_camera_base, alone.T_camera_base, atol=1e-5)
-    assert beside.change_cost == pytest.approx(alone.change_cost, rel=1e-3)
+    assert beside.cost == pytest.approx(alone.cost, rel=1e-3)
     assert len(beside.edges) == len(alone.edges)
     other = replace(view, configuration=at[0].configuration)
     (wrong,) = evaluate_poses(session, names, 2, T[None], other)
@@ -1041,7 +1041,7 @@ def test_no_pose_is_scored_twice(searched):
     hypotheses = PoseHypotheses(np.concatenate([true, true]), np.array([20.0, 20.0]), 1.0)
     one, queries = rescore_poses(session, at[2], numbers, hypotheses, true)
     again, both = rescore_poses(session, at[2], numbers, hypotheses, true, queries)
-    assert len(both.change_cost) == len(queries.change_cost)
+    assert len(both.cost) == len(queries.cost)
     np.testing.assert_array_equal(again.T_camera_base, one.T_camera_base)
 
 

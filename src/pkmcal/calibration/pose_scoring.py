@@ -155,14 +155,14 @@ class EvaluatedPose(NamedTuple):
 
     state : of this image alone; poses of other configurations are those of the start.
     edges : silhouettes of the image.
-    change_cost : of the machine, half the sum of squares by which the parameters and the joint
+    cost : of the machine, half the sum of squares by which the parameters and the joint
         readings are moved.
     """
 
     machine: Machine
     state: State
     edges: EdgeSet
-    change_cost: float
+    cost: float
 
     @property
     def T_camera_base(self) -> Array:
@@ -243,13 +243,13 @@ class ScoredPoses(NamedTuple):
     """Scored poses (n, 4, 4) of one image.
 
     scores : (n,) log-likelihood ratio of the machine at each pose.
-    change_cost : (n,), of the machine.
+    cost : (n,), of the machine.
     failures : why further poses could not be tested.
     """
 
     T_camera_base: Array
     scores: Array
-    change_cost: Array
+    cost: Array
     failures: tuple[str, ...] = ()
 
     @classmethod
@@ -307,12 +307,12 @@ def rescore_poses(
         [*previous.T_camera_base, *settled[order]],
         [*previous.scores, *log_likelihood_ratio[order]],
     )
-    change_cost = [*previous.change_cost, *np.zeros(len(order))]
+    cost = [*previous.cost, *np.zeros(len(order))]
     failures = [*previous.failures]
     # estimate the machine with the camera at each remaining pose
     tried = places[order]
     if before.edges:  # the prior allows no large change
-        worth = np.array(fits) / hypotheses.unit - change_cost
+        worth = np.array(fits) / hypotheses.unit - cost
         tried = tried[worth[count:] >= worth.max() - _OPTIONS.most_behind_best]
     for one in evaluate_poses(session, before, p.station, tried, view):
         if isinstance(one, PkmcalError):  # such as too few legs measured
@@ -320,12 +320,12 @@ def rescore_poses(
             continue
         T, changed = one.T_camera_base[None], one.view_in(view)
         there, fit = refine_ml(changed, T, first, 16, 6, scatter)
-        at, fits, change_cost = (
+        at, fits, cost = (
             [*at, there[0]],
             [*fits, float(fit[0])],
-            [*change_cost, one.change_cost],
+            [*cost, one.cost],
         )
-    previous = ScoredPoses(np.stack(at), np.array(fits), np.array(change_cost), tuple(failures))
+    previous = ScoredPoses(np.stack(at), np.array(fits), np.array(cost), tuple(failures))
     return _weighed(view, previous, hypotheses.unit), previous
 
 
@@ -334,11 +334,11 @@ def _weighed(view: StationView, scores: ScoredPoses, unit: float) -> PoseHypothe
 
     Poses equal to the best one, or symmetric to it, are compared by edges, the others by legs.
     """
-    at, log_likelihood_ratio, change_cost, _ = scores
+    at, log_likelihood_ratio, cost, _ = scores
     edge = correlation_length(view, at[np.argmax(log_likelihood_ratio)])
     by_edges, by_legs = (
-        log_likelihood_ratio / edge - change_cost,
-        log_likelihood_ratio / unit - change_cost,
+        log_likelihood_ratio / edge - cost,
+        log_likelihood_ratio / unit - cost,
     )
     first = at[np.argmax(by_edges)]
     here = same_pose(at, first)
