@@ -289,7 +289,8 @@ def test_a_first_configuration_that_the_nominal_legs_do_not_reach(demo):
     session = load_session(demo.session)
     machine = session.machine
     joints = session.joints.copy()
-    joints[0] = machine.inverse(machine.home()) + [0.3, 0, 0, 0, 0, 0]
+    joints[0] = machine.inverse(machine.home())
+    joints[0, 0] += 0.3
     session = replace(session, joints=joints)
     assert 1e-3 < session.forward.error[0] < 5e-3
     kinematics = _kinematics(session, np.random.default_rng(0))

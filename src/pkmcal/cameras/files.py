@@ -436,7 +436,7 @@ def _camera_info_file(document: Document) -> Document:
         for key, name in names.items()
         if key in data
     }
-    lines = {
+    lines: dict[tuple[str | int, ...], int] = {
         (names[key],): document.lines[original,]
         for original in document.data
         if (key := original.lower() if len(original) == 1 else original) in names
