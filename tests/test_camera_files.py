@@ -619,12 +619,38 @@ def test_printed_messages_of_ros(tmp_path, ros2, messages):
 
 
 @pytest.mark.parametrize(
-    ("old", "new"), [("x_offset: 0", "x_offset: 64"), ("binning_y: 0", "binning_y: 2")]
+    ("old", "new"),
+    [
+        ("x_offset: 0", "x_offset: 64"),
+        ("  height: 0\n  width: 0", "  height: 240\n  width: 320"),
+        ("binning_y: 0", "binning_y: 2"),
+    ],
 )
 def test_a_ros_message_about_a_part_of_the_sensor(tmp_path, old, new):
     (tmp_path / "info.yaml").write_text(MESSAGE.replace(old, new))
     with raises(InputError, code="camera.region"):
         load_camera(tmp_path / "info.yaml")
+
+
+@pytest.mark.parametrize("before", ["", "---\n", "# a comment\n---\n"])
+def test_a_ros_message_of_the_whole_sensor(tmp_path, before):
+    whole = MESSAGE.replace("  height: 0\n  width: 0", "  height: 480\n  width: 640")
+    (tmp_path / "info.yaml").write_text(before + whole)
+    assert load_camera(tmp_path / "info.yaml").parameters[4] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("field", "line"), [("D", None), ("K", 8), ("width", 5), ("distortion_model", 6)]
+)
+def test_a_fault_of_a_ros_message_has_its_line(tmp_path, field, line):
+    """Of a message without coefficients too, which is not taken for a lens without distortion."""
+    new = f"{field}: -1\n" if line else ""
+    text = re.sub(rf"^{field}: .*\n", new, MESSAGE, flags=re.MULTILINE)
+    (tmp_path / "info.yaml").write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_camera(tmp_path / "info.yaml")
+    where = str(caught.value.where)
+    assert f"line {line}," in where if line else where.endswith("distortion_coefficients.data")
 
 
 @pytest.mark.parametrize(
@@ -639,6 +665,12 @@ def test_other_files_of_kalibr(tmp_path, text):
     (tmp_path / "file.yaml").write_text(text)
     with raises(InputError, code="camera.other_file"):
         load_camera(tmp_path / "file.yaml")
+
+
+def test_an_mrcal_file_with_a_list_for_a_key(tmp_path):
+    (tmp_path / "a.cameramodel").write_text("{'lensmodel': 'LENSMODEL_PINHOLE', [1]: 2}\n")
+    with raises(InputError, where="a.cameramodel"):
+        load_camera(tmp_path / "a.cameramodel")
 
 
 @pytest.mark.parametrize("without", ["camera_model", "intrinsics", "resolution"])

@@ -284,6 +284,21 @@ def test_another_assembly_mode_nearby_is_named(demo, about, degrees, near):
         assert finding.facts["turn"] == pytest.approx(np.radians(16), rel=0.2)
 
 
+def test_a_first_configuration_that_the_nominal_legs_do_not_reach(demo):
+    """By less than the prior sigmas allow: it has no assembly mode, and the check goes on."""
+    session = load_session(demo.session)
+    machine = session.machine
+    joints = session.joints.copy()
+    joints[0] = machine.inverse(machine.home())
+    joints[0, 0] += 0.3
+    session = replace(session, joints=joints)
+    assert 1e-3 < session.forward.error[0] < 5e-3
+    kinematics = _kinematics(session, np.random.default_rng(0))
+    assert kinematics.assemblies == 0
+    assert "configurations.other_assembly" not in [f.code for f in kinematics.findings]
+    assert kinematics.poses is not None
+
+
 def test_nearly_singular_configurations_are_named(demo):
     """The fourth one a degree from Fichter's singularity, a quarter turn about the vertical."""
     session = load_session(demo.session)

@@ -107,6 +107,7 @@ def test_three_joints_have_up_to_four_poses_the_true_one_among_them(camera, poin
     places = projected(camera, truth, pins)
     poses = triangle_poses(camera, pins, places)
     assert 1 <= len(poses) <= 4
+    assert (apply(poses[:, None], pins[:3])[..., 2] > 0).all()
     errors = [np.linalg.norm(pose_difference(one, truth)) for one in poses]
     assert min(errors) < 1e-5
     exact = [np.sort(np.abs(projected(camera, one, pins) - places).max(axis=1)) for one in poses]

@@ -364,6 +364,14 @@ def test_a_session_of_one_image_is_viewed_and_placed(session, truth):
     value = opened.ask("localize", pose=rough.tolist(), pins=[fourth])
     assert not value["localized"]
     assert all(off(place, true)[0] > 10 for place in value["places"])
+    # three joints at their places, and no pose but the files' own
+    pins = [
+        {"image": 0, "leg": one["leg"], "end": one["end"], "pixel": one["at"]}
+        for one in (joints[k] for k in (0, 3, 8))
+    ]
+    value = opened.ask("localize", pins=pins)
+    assert value["localized"]
+    assert off(value["overlay"]["pose"], true)[0] < 1.5
     assert pkmcal.view(session).document["kind"] == "session"
 
 

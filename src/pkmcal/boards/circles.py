@@ -165,9 +165,11 @@ def _on_board(lattice: Lattice, blobs: Array, board: Board) -> tuple[Array | Non
     cells = fits[0][0][3]
     point_at = {tuple(cell): int(k) for cell, k in zip(cells.tolist(), lattice.points, strict=True)}
     points = np.array([point_at.get(tuple(cell), -1) for cell in around.tolist()])
-    seen = (points >= 0).reshape(rows + 2, columns + 2)
+    present = (points >= 0).reshape(rows + 2, columns + 2)
     border, beyond = (
-        np.concatenate([seen[[k, -1 - k], 1:-1].mean(axis=1), seen[1:-1, [k, -1 - k]].mean(axis=0)])
+        np.concatenate(
+            [present[[k, -1 - k], 1:-1].mean(axis=1), present[1:-1, [k, -1 - k]].mean(axis=0)]
+        )
         for k in (1, 0)
     )
     # too few circles of an outer row or column do not tell it from a stray blob beside it

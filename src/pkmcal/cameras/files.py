@@ -101,7 +101,8 @@ def _text_of(path: Path, label: str) -> str:
     if text.startswith("%YAML:1.0") and "opencv-matrix" not in text and "camera_model:" in text:
         return text.replace("%", "#", 1)
     if "distortion_model:" in text and re.search(r"^[kK]:", text, re.MULTILINE):
-        return re.split(r"^---\s*$", text.removeprefix("---"), maxsplit=1, flags=re.MULTILINE)[0]
+        parts = re.split(r"^---\s*$", text, flags=re.MULTILINE)
+        return next(part for part in parts if "distortion_model:" in part)
     return text
 
 
@@ -426,25 +427,37 @@ def _camera_info_file(document: Document) -> Document:
     roi = data.get("roi")
     part = roi if isinstance(roi, dict) else {}
     shift = [part.get(key, 0) for key in ("x_offset", "y_offset")]
+    # 0 for the whole image
+    size = [part.get(key, 0) or data[key] for key in ("width", "height")]
+    is_part = any(shift) or size != [data["width"], data["height"]]
     binning = [data.get(key, 0) for key in ("binning_x", "binning_y")]
-    if any(shift) or any(n not in (0, 1) for n in binning):
+    if is_part or any(n not in (0, 1) for n in binning):
         raise InputError(
             "the images are a part of the sensor, or binned, and the camera's numbers are those of"
             " the whole",
-            where=document.where("roi" if any(shift) else "binning_x"),
-            found=f"a shift of {quoted(shift)} and binning {quoted(binning)}",
-            expected="zeros",
+            where=document.where("roi" if is_part else "binning_x"),
+            found=f"a shift of {quoted(shift)}, a size of {quoted(size)} and binning"
+            f" {quoted(binning)}",
+            expected="no shift, the whole size and no binning",
             next_step="Take whole images, or calibrate again from images of a board: pkmcal camera",
             code="camera.region",
         )
     names = {
         "k": "camera_matrix", "d": "distortion_coefficients", "r": "rectification_matrix",
-        "p": "projection_matrix",
+        "p": "projection_matrix", "width": "image_width", "height": "image_height",
+        "distortion_model": "distortion_model",
     }  # fmt: skip
-    file = {"distortion_model": data["distortion_model"]}
-    file |= {"image_width": data["width"], "image_height": data["height"]}
-    file |= {name: {"data": data[key]} for key, name in names.items() if key in data}
-    return replace(document, data=file, lines={})
+    file = {
+        name: {"data": data[key]} if len(key) == 1 else data[key]
+        for key, name in names.items()
+        if key in data
+    }
+    lines: dict[tuple[str | int, ...], int] = {
+        (names[key],): document.lines[original,]
+        for original in document.data
+        if (key := original.lower() if len(original) == 1 else original) in names
+    }
+    return replace(document, data=file, lines=lines)
 
 
 def _from_ros(document: Document) -> Camera:
@@ -457,7 +470,7 @@ def _from_ros(document: Document) -> Camera:
     size = _size_at(document, ("image_width",), ("image_height",))
     matrix = _numbers_at(document, ("camera_matrix", "data"), (9,))
     k = np.zeros(0)
-    if "distortion_coefficients" in document.data:
+    if word not in _ROS_ZERO or "distortion_coefficients" in document.data:
         k = _numbers_at(document, ("distortion_coefficients", "data"), range(15))
         _check_coefficients(k, document.where("distortion_coefficients"))
     if word in _ROS_ZERO and k.any():

@@ -40,8 +40,8 @@ def read_mrcal(text: str, label: str) -> Intrinsics:
         data = ast.literal_eval(tree)
     except SyntaxError as error:
         line, found = error.lineno, error.text and error.text.strip()
-    except (ValueError, RecursionError, MemoryError):
-        pass  # the line is known, or the text is none of mrcal's
+    except (ValueError, TypeError, RecursionError, MemoryError):
+        pass  # the line is known, or the text is none of mrcal's; TypeError: a list as a key
     if not isinstance(data, dict):
         raise InputError(
             "not valid as mrcal writes it",

@@ -38,10 +38,11 @@ from pkmcal.solver.ranks import RANK_TOLERANCE, column_space, inverse_root
 from pkmcal.solver.search import Stop
 
 SOFT_READING_NOISES = 0.01, 0.001, 0.0001
-"""Standard deviation (m, rad) of readings in the estimate of stations and poses: tens of times the
-uncertainty by an image, so that an observed pose hardly depends on them. The smaller ones serve
-where the search does not converge: where readings alone tell the board's place from the camera's,
-as on a platform that hardly rotates, softness lets both slide along a curved valley.
+"""Standard deviations (m, rad) of readings in the estimate of stations and poses. The first is tens
+of times the uncertainty by an image, so that an observed pose hardly depends on them. The smaller
+ones serve where the search does not converge: where readings alone tell the board's place from the
+camera's, as on a platform that hardly rotates, softness lets both slide along a curved valley.
+Poses then depend on readings more; each configuration's own are removed in any case.
 """
 WIDEST_PREDICTION = 0.1
 """Largest standard deviation (m, rad) of a predicted reading: beyond it the leave-one-out fit, a
@@ -158,7 +159,8 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
 
 def _softly_held(machine: Machine, measurements: Measurements, near: State) -> tuple[float, Held]:
     """The largest of SOFT_READING_NOISES with which the search ends, and its fit."""
-    for soft in (max(noise, measurements.joint_noise) for noise in SOFT_READING_NOISES):
+    softer = [noise for noise in SOFT_READING_NOISES if noise > measurements.joint_noise]
+    for soft in softer or [measurements.joint_noise]:
         held = hold(machine, replace(measurements, joint_noise=soft), near)
         if held.stop is Stop.CONVERGED:
             return soft, held

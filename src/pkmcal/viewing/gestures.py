@@ -118,7 +118,7 @@ def pinned(
 
 
 def triangle_poses(camera: Camera, pins: Array, pixels: Array) -> Array:
-    """Poses (n, 4, 4), up to four, that bring three joints exactly to their pixels: those of n
+    """Poses (k, 4, 4), up to four, that bring three joints exactly to their pixels: those of n
     joints that span the largest triangle in the image. None for fewer than three joints.
 
     pins : (n, 3), base frame, m. pixels : (n, 2).
@@ -137,7 +137,10 @@ def triangle_poses(camera: Camera, pins: Array, pixels: Array) -> Array:
         pins[widest], plane[widest], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P
     )
     turn, shift = (np.array(part, dtype=float).reshape(-1, 3) for part in (turns, shifts))
-    return pose(rotation(turn), shift)
+    poses = pose(rotation(turn), shift)
+    # the mirror images of poses, behind the camera, solve the same equations
+    before_camera = apply(poses[:, None], pins[widest])[..., 2] > 0
+    return poses[before_camera.all(axis=1)]
 
 
 def _motion(T_camera_base: Array, points: Array) -> Callable[[Array], Array]:

@@ -492,6 +492,7 @@ class SessionView {
       this.begin();
     }
     if (joint) {
+      if (!this.pose.pins.length) this.pose.unpinned = pose;
       this.pose.pins = [...drag.others, { image: this.k, end: joint.end, leg: joint.leg, pixel: at }];
       void this.requestOverlay({ pose, pins: this.pose.pins });
       return;
@@ -565,7 +566,10 @@ class SessionView {
     this.notify("Localizing …");
     this.measuring += 1;
     this.fitButton.disabled = this.searchButton.disabled = true;
-    const answer = await this.query<LocalizationAnswer>("localize", this.request({ anywhere }));
+    // the joints are evidence, beside the pose as the hand set it before them
+    const { pins, unpinned, pose } = this.pose;
+    const body = this.request({ anywhere, pins, pose: pins.length ? unpinned : pose });
+    const answer = await this.query<LocalizationAnswer>("localize", body);
     this.measuring -= 1;
     this.showState();
     if (!answer || epoch !== this.epoch) return;

@@ -6,6 +6,7 @@ export type Pose = NonNullable<ViewRequest["pose"]>;
 interface Step {
   pose: Pose | null;
   pins: Pin[];
+  unpinned: Pose | null;
   numbers: Pin[];
   changed: boolean;
 }
@@ -15,6 +16,8 @@ export class StationPose {
   pose: Pose | null = null;
   /** Joints placed at pixels. */
   pins: Pin[] = [];
+  /** The pose before them; null for the files' own. */
+  unpinned: Pose | null = null;
   /** Legs numbered at pixels: they hold wherever the machine is. */
   numbers: Pin[] = [];
   /** Whether session.yaml has another pose. */
@@ -29,8 +32,8 @@ export class StationPose {
 
   /** Begin a change. */
   begin(): void {
-    const { pose, pins, numbers, changed } = this;
-    this.before.push({ pose, pins, numbers, changed });
+    const { pose, pins, unpinned, numbers, changed } = this;
+    this.before.push({ pose, pins, unpinned, numbers, changed });
     this.changed = true;
   }
 
