@@ -76,7 +76,8 @@ def test_lengths_with_units_are_what_they_are_in_metres(folder):
 
 OTHERS = {
     "ros": "image_width: 8\nimage_height: 6\ndistortion_model: plumb_bob\n"
-    "camera_matrix: {rows: 3, cols: 3, data: [9, 0, 3.5, 0, 9, 2.5, 0, 0, 1]}\n",
+    "camera_matrix: {rows: 3, cols: 3, data: [9, 0, 3.5, 0, 9, 2.5, 0, 0, 1]}\n"
+    "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n",
     "kalibr": "cam0:\n  camera_model: pinhole\n  distortion_model: none\n"
     "  intrinsics: [9, 9, 3.5, 2.5]\n  resolution: [8, 6]\n",
 }
